@@ -1,0 +1,1 @@
+//! Reads what microscopes write; keeps tile pyramids and the catalog.

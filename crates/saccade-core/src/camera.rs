@@ -1,0 +1,185 @@
+//! An orbiting camera in physical space.
+
+use std::fmt;
+use std::str::FromStr;
+
+use glam::{DMat3, DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::space::{Physical, Point};
+use crate::volume::Volume;
+
+/// Looks at `target` from `distance_nm` away.
+///
+/// As text: `yaw,pitch,distance,x,y,z` in degrees and nanometres, optionally `,fov` in degrees.
+/// At yaw 0 and pitch 0 it looks along +z with x to the right and y down, as section images are
+/// drawn; positive yaw moves the eye to the right, positive pitch up.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// Point in the middle of the picture \[nm\].
+    pub target: Point<Physical>,
+    /// Distance of the eye from the target \[nm\].
+    pub distance_nm: f64,
+    /// Turn about the vertical axis \[degrees\].
+    pub yaw: f64,
+    /// Turn about the horizontal axis \[degrees\], within ±90.
+    pub pitch: f64,
+    /// Vertical opening angle \[degrees\].
+    pub fov: f64,
+}
+
+/// Text that names no camera.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("camera {text:?} is not yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres")]
+pub struct ParseCameraError {
+    /// As given.
+    pub text: String,
+}
+
+impl Camera {
+    /// Opening angle unless another is asked for \[degrees\].
+    pub const FOV: f64 = 35.0;
+
+    /// Sees the whole volume, from a corner.
+    pub fn around(volume: &Volume) -> Self {
+        let size = volume.size_nm();
+        let radius = size.length() / 2.0;
+        Self {
+            target: Point::new(size / 2.0),
+            distance_nm: 1.02 * radius / (Self::FOV / 2.0).to_radians().sin(),
+            yaw: 30.0,
+            pitch: 25.0,
+            fov: Self::FOV,
+        }
+    }
+
+    /// Right, down and forward: unit vectors in physical space, as columns.
+    pub fn physical_from_eye_axes(&self) -> DMat3 {
+        let (sy, cy) = self.yaw.to_radians().sin_cos();
+        let (sp, cp) = self.pitch.to_radians().sin_cos();
+        let right = DVec3::new(cy, 0.0, sy);
+        let forward = DVec3::new(-sy * cp, sp, cy * cp);
+        DMat3::from_cols(right, forward.cross(right), forward)
+    }
+
+    /// Where the eye is.
+    pub fn eye(&self) -> Point<Physical> {
+        Point::new(self.target.xyz - self.physical_from_eye_axes().z_axis * self.distance_nm)
+    }
+
+    /// Direction of the ray through a pixel's centre, not normalised: its component along the
+    /// viewing direction is 1. Pixels count from the upper left.
+    pub fn ray(&self, pixel: DVec2, image: DVec2) -> DVec3 {
+        let tangent = (self.fov / 2.0).to_radians().tan();
+        let at = (pixel * 2.0 - image) / image.y * tangent;
+        self.physical_from_eye_axes() * DVec3::new(at.x, at.y, 1.0)
+    }
+
+    /// Size that one pixel has at a distance along the viewing direction \[nm\].
+    pub fn pixel_nm(&self, depth_nm: f64, image_height: f64) -> f64 {
+        2.0 * depth_nm * (self.fov / 2.0).to_radians().tan() / image_height
+    }
+
+    /// Turned about the target by degrees; pitch stops at the poles.
+    pub fn orbited(self, yaw: f64, pitch: f64) -> Self {
+        let yaw = (self.yaw + yaw).rem_euclid(360.0);
+        Self { yaw, pitch: (self.pitch + pitch).clamp(-89.9, 89.9), ..self }
+    }
+
+    /// Moved so that what was seen at the target moves by `pixels` on an image of that height.
+    pub fn panned(self, pixels: DVec2, image_height: f64) -> Self {
+        let axes = self.physical_from_eye_axes();
+        let by = pixels * self.pixel_nm(self.distance_nm, image_height);
+        let target = self.target.xyz - axes.x_axis * by.x - axes.y_axis * by.y;
+        Self { target: Point::new(target), ..self }
+    }
+
+    /// Closer by a factor above 1, farther by one below.
+    pub fn zoomed(self, factor: f64) -> Self {
+        Self { distance_nm: (self.distance_nm / factor).clamp(1e-3, 1e15), ..self }
+    }
+}
+
+impl fmt::Display for Camera {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let DVec3 { x, y, z } = self.target.xyz;
+        let Self { yaw, pitch, distance_nm, fov, .. } = self;
+        write!(f, "{yaw},{pitch},{distance_nm},{x},{y},{z},{fov}")
+    }
+}
+
+impl FromStr for Camera {
+    type Err = ParseCameraError;
+    fn from_str(text: &str) -> Result<Self, ParseCameraError> {
+        let error = || ParseCameraError { text: text.to_owned() };
+        let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+        let numbers = numbers.map_err(|_| error())?;
+        let (yaw, pitch, distance_nm, target, fov) = match numbers[..] {
+            [yaw, pitch, distance, x, y, z] => (yaw, pitch, distance, [x, y, z], Self::FOV),
+            [yaw, pitch, distance, x, y, z, fov] => (yaw, pitch, distance, [x, y, z], fov),
+            _ => return Err(error()),
+        };
+        let finite = numbers.iter().all(|n| n.is_finite());
+        if !finite || distance_nm <= 0.0 || pitch.abs() > 90.0 || !(fov > 0.0 && fov < 180.0) {
+            return Err(error());
+        }
+        Ok(Self { target: Point::new(target.into()), distance_nm, yaw, pitch, fov })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::UVec3;
+
+    fn volume() -> Volume {
+        Volume::new("v", UVec3::new(100, 80, 10), DVec3::new(4.0, 4.0, 40.0)).unwrap()
+    }
+
+    #[test]
+    fn looks_as_sections_are_drawn() {
+        let camera = Camera { yaw: 0.0, pitch: 0.0, ..Camera::around(&volume()) };
+        let axes = camera.physical_from_eye_axes();
+        assert!((axes.x_axis - DVec3::X).length() < 1e-12);
+        assert!((axes.y_axis - DVec3::Y).length() < 1e-12, "y runs down in image and volume");
+        assert!((axes.z_axis - DVec3::Z).length() < 1e-12);
+    }
+
+    #[test]
+    fn positive_yaw_moves_the_eye_right_and_positive_pitch_up() {
+        let front = Camera { yaw: 0.0, pitch: 0.0, ..Camera::around(&volume()) };
+        assert!(front.orbited(20.0, 0.0).eye().xyz.x > front.eye().xyz.x);
+        assert!(front.orbited(0.0, 20.0).eye().xyz.y < front.eye().xyz.y, "up is towards -y");
+    }
+
+    #[test]
+    fn axes_are_right_handed_and_unit_everywhere() {
+        for yaw in [0.0, 77.0, 180.0, 301.0] {
+            for pitch in [-89.9, -10.0, 0.0, 60.0] {
+                let camera = Camera { yaw, pitch, ..Camera::around(&volume()) };
+                let m = camera.physical_from_eye_axes();
+                assert!((m.determinant() - 1.0).abs() < 1e-9);
+                assert!((m.transpose() * m - DMat3::IDENTITY).abs_diff_eq(DMat3::ZERO, 1e-9));
+            }
+        }
+    }
+
+    #[test]
+    fn text_survives() {
+        let camera = Camera::around(&volume()).orbited(11.5, -3.0);
+        assert_eq!(camera.to_string().parse::<Camera>().unwrap(), camera);
+        for bad in ["", "1,2,3", "0,0,-5,0,0,0", "0,0,inf,0,0,0", "0,99,1,0,0,0", "0,0,1,0,0,0,180"] {
+            assert!(bad.parse::<Camera>().is_err(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn panning_follows_the_hand() {
+        let camera = Camera { yaw: 0.0, pitch: 0.0, ..Camera::around(&volume()) };
+        let image = DVec2::new(640.0, 480.0);
+        let moved = camera.panned(DVec2::new(100.0, 0.0), image.y);
+        // The old target now appears 100 pixels right of the centre.
+        let ray = moved.ray(DVec2::new(420.0, 240.0), image) * moved.distance_nm;
+        assert!((moved.eye().xyz + ray - camera.target.xyz).length() < 1e-6);
+    }
+}

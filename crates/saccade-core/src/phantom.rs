@@ -1,0 +1,1 @@
+//! Procedural tissue: any extent, any voxel computable alone.

@@ -1,0 +1,127 @@
+//! A first transfer function from a histogram, so that the first look shows structure.
+
+use super::{ColorMap, OpacityPoint, TransferFunction};
+use crate::volume::Polarity;
+
+/// Counts of 8-bit values. Value 0, nothing acquired, is not counted.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Histogram {
+    counts: [u64; 256],
+}
+
+impl Default for Histogram {
+    fn default() -> Self {
+        Self { counts: [0; 256] }
+    }
+}
+
+impl Histogram {
+    /// Counts more voxels.
+    pub fn add(&mut self, values: &[u8]) {
+        for &value in values {
+            self.counts[usize::from(value)] += 1;
+        }
+        self.counts[0] = 0;
+    }
+
+    /// Voxels counted.
+    pub fn total(&self) -> u64 {
+        self.counts.iter().sum()
+    }
+
+    /// Count per value.
+    pub fn counts(&self) -> &[u64; 256] {
+        &self.counts
+    }
+
+    /// Smallest value that at least this share of the voxels does not exceed.
+    pub fn percentile(&self, share: f64) -> u8 {
+        let want = share * self.total() as f64;
+        let mut seen = 0;
+        for (value, &count) in (0..=u8::MAX).zip(&self.counts) {
+            seen += count;
+            if seen > 0 && seen as f64 >= want {
+                return value;
+            }
+        }
+        u8::MAX
+    }
+
+    /// Where the structures are: the thin tail of the distribution. Membranes are the dark tail of
+    /// bright tissue; labelled cells the bright tail of a dark field.
+    pub fn polarity(&self) -> Polarity {
+        let [low, middle, high] = [0.02, 0.5, 0.98].map(|p| i32::from(self.percentile(p)));
+        if middle - low > high - middle { Polarity::Dark } else { Polarity::Bright }
+    }
+
+    /// A transfer function that shows the tail of the distribution and hides its bulk.
+    ///
+    /// `size_nm` is the longest side of the volume: opacity is chosen so that a ray sees some
+    /// depth of it. An empty histogram gives a plain ramp over all values.
+    pub fn transfer_function(&self, size_nm: f64) -> TransferFunction {
+        let polarity = self.polarity();
+        let unit = |v: u8| f32::from(v) / 255.0;
+        let [low, high] =
+            if self.total() == 0 { [0.0, 1.0] } else { [0.005, 0.995].map(|p| unit(self.percentile(p))) };
+        let high = high.max(low + 2.0 / 255.0);
+        let point = |value, opacity| OpacityPoint { value, opacity };
+        let opacity = match polarity {
+            Polarity::Dark => {
+                let from = unit(self.percentile(0.03)).max(low + 0.5 / 255.0);
+                let to = unit(self.percentile(0.40)).max(from + 1.0 / 255.0);
+                vec![point(from, 0.85), point(to, 0.0)]
+            }
+            Polarity::Bright => {
+                let from = unit(self.percentile(0.60)).min(high - 1.5 / 255.0).max(low);
+                vec![point(from, 0.0), point(high, 0.85)]
+            }
+        };
+        TransferFunction {
+            polarity,
+            color_map: ColorMap::Gray,
+            window: [low, high],
+            opacity,
+            opacity_length_nm: size_nm / 64.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bell(centre: f64, width: f64, tail_centre: f64) -> Histogram {
+        let mut histogram = Histogram::default();
+        for value in 1..=255_u8 {
+            let bump = |c: f64, w: f64| (-((f64::from(value) - c) / w).powi(2)).exp();
+            let count = 10_000.0 * bump(centre, width) + 1_000.0 * bump(tail_centre, width);
+            histogram.add(&vec![value; count as usize]);
+        }
+        histogram
+    }
+
+    #[test]
+    fn em_is_dark_on_bright_and_fluorescence_is_not() {
+        let em = bell(170.0, 20.0, 80.0);
+        let tf = em.transfer_function(1000.0);
+        assert_eq!(tf.polarity, Polarity::Dark);
+        assert!(tf.opacity_at(80.0 / 255.0) > 0.5, "membranes are seen");
+        assert!(tf.opacity_at(175.0 / 255.0) < 0.05, "cytoplasm is not");
+
+        let fluorescence = bell(30.0, 10.0, 160.0);
+        let tf = fluorescence.transfer_function(1000.0);
+        assert_eq!(tf.polarity, Polarity::Bright);
+        assert!(tf.opacity_at(160.0 / 255.0) > 0.5 && tf.opacity_at(20.0 / 255.0) < 0.05);
+    }
+
+    #[test]
+    fn degenerate_histograms_give_rising_corners() {
+        let mut constant = Histogram::default();
+        constant.add(&[255; 100]);
+        for histogram in [Histogram::default(), constant] {
+            let tf = histogram.transfer_function(1.0);
+            assert!(tf.opacity.windows(2).all(|p| p[0].value < p[1].value), "{:?}", tf.opacity);
+            assert!(tf.window[0] < tf.window[1]);
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! What a volume is, before any voxel of it is known.
+
+use glam::{DVec3, UVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::levels::{Level, halving_levels};
+use crate::space::{Map, Normalised, Physical, Voxel};
+
+/// How a voxel's value is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum Dtype {
+    /// 8 bit, unsigned.
+    Uint8,
+    /// 16 bit, unsigned, little-endian.
+    Uint16,
+}
+
+impl Dtype {
+    /// Bytes per voxel.
+    pub const fn bytes(self) -> usize {
+        match self {
+            Self::Uint8 => 1,
+            Self::Uint16 => 2,
+        }
+    }
+}
+
+/// A virtual 3D image: its shape is known, its voxels may not exist yet.
+///
+/// Value 0 means "nothing was acquired here"; sources keep measured values at 1 or above.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Volume {
+    /// Name in addresses and file names.
+    pub name: String,
+    /// Value type of every channel.
+    pub dtype: Dtype,
+    /// Names of the channels; at least one.
+    pub channels: Vec<String>,
+    /// Voxel size at level 0 \[nm\].
+    pub voxel_nm: DVec3,
+    /// Levels, finest first; at least one.
+    pub levels: Vec<Level>,
+    /// Chunk size of every level \[voxels of the level\].
+    pub chunk: UVec3,
+}
+
+/// A volume that cannot be.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum VolumeError {
+    /// An axis without voxels.
+    #[error("volume extent {extent} has an empty axis; give the size in voxels as x,y,z")]
+    Extent {
+        /// As given \[voxels\].
+        extent: UVec3,
+    },
+    /// A voxel size that is zero, negative or not a number.
+    #[error("voxel size {voxel_nm} nm is not positive; give nanometres as x,y,z")]
+    VoxelSize {
+        /// As given \[nm\].
+        voxel_nm: DVec3,
+    },
+}
+
+impl Volume {
+    /// A single-channel 8-bit volume with halving levels.
+    ///
+    /// # Errors
+    ///
+    /// [`VolumeError`] on an empty extent or an impossible voxel size.
+    pub fn new(name: &str, extent: UVec3, voxel_nm: DVec3) -> Result<Self, VolumeError> {
+        if extent.min_element() == 0 {
+            return Err(VolumeError::Extent { extent });
+        }
+        if !(voxel_nm.is_finite() && voxel_nm.min_element() > 0.0) {
+            return Err(VolumeError::VoxelSize { voxel_nm });
+        }
+        Ok(Self {
+            name: name.to_owned(),
+            dtype: Dtype::Uint8,
+            channels: vec!["intensity".to_owned()],
+            voxel_nm,
+            levels: halving_levels(extent, voxel_nm),
+            chunk: UVec3::new(64, 64, 32),
+        })
+    }
+
+    /// Size at level 0 \[voxels\].
+    pub fn extent(&self) -> UVec3 {
+        self.levels[0].extent
+    }
+
+    /// Size \[nm\].
+    pub fn size_nm(&self) -> DVec3 {
+        self.extent().as_dvec3() * self.voxel_nm
+    }
+
+    /// To nanometres from level-0 voxels.
+    pub fn physical_from_voxel(&self) -> Map<Physical, Voxel> {
+        Map::scale(self.voxel_nm)
+    }
+
+    /// To nanometres from `[0, 1]` per axis.
+    pub fn physical_from_normalised(&self) -> Map<Physical, Normalised> {
+        Map::scale(self.size_nm())
+    }
+
+    /// Chunks per axis of a level.
+    pub fn chunks(&self, level: usize) -> UVec3 {
+        (self.levels[level].extent + (self.chunk - 1)) / self.chunk
+    }
+}
+
+/// On which side of the histogram the structures are that should be seen.
+///
+/// Interpolation between tissue and "nothing acquired" passes through all values in between. To
+/// keep that transition on the transparent side, bricks of dark structures are stored inverted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Polarity {
+    /// Fluorescence: structures are bright.
+    #[default]
+    Bright,
+    /// Electron microscopy: structures are dark.
+    Dark,
+}
+
+impl Polarity {
+    /// The 8-bit value as a brick stores it. Nothing acquired stays 0; the map is its own inverse.
+    pub const fn stored(self, value: u8) -> u8 {
+        match self {
+            Self::Bright => value,
+            Self::Dark => value.wrapping_neg(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn polarity_is_its_own_inverse_and_keeps_nothing() {
+        for polarity in [Polarity::Bright, Polarity::Dark] {
+            assert_eq!(polarity.stored(0), 0);
+            for value in 0..=255 {
+                assert_eq!(polarity.stored(polarity.stored(value)), value);
+            }
+        }
+        assert_eq!(Polarity::Dark.stored(255), 1);
+        assert_eq!(Polarity::Dark.stored(1), 255);
+    }
+
+    #[test]
+    fn impossible_volumes_are_refused() {
+        let nm = DVec3::splat(4.0);
+        assert!(Volume::new("v", UVec3::new(4, 0, 4), nm).is_err());
+        assert!(Volume::new("v", UVec3::ONE, DVec3::new(1.0, -1.0, 1.0)).is_err());
+        assert!(Volume::new("v", UVec3::ONE, DVec3::NAN).is_err());
+    }
+
+    #[test]
+    fn descriptions_survive_json() {
+        let v = Volume::new("v", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+        let json = serde_json::to_string(&v).unwrap();
+        assert_eq!(serde_json::from_str::<Volume>(&json).unwrap(), v);
+    }
+}

@@ -1,0 +1,1 @@
+//! GPU virtual memory and the ray-caster.

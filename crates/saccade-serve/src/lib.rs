@@ -1,0 +1,1 @@
+//! Volumes over HTTP: chunks, metadata, change events and the browser application.

@@ -1,0 +1,168 @@
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use glam::UVec3;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use serde::{Deserialize, Serialize};
+
+use crate::maybe_send::{BoxFuture, BoxStream, MaybeSend, MaybeSync};
+
+/// Names one chunk of a volume.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct ChunkId {
+    /// Channel.
+    pub channel: u32,
+    /// Level, 0 the finest.
+    pub level: u32,
+    /// Position \[chunks of the level\].
+    pub chunk: UVec3,
+}
+
+impl ChunkId {
+    /// Voxels of the level the chunk covers, cut at the volume's end; `None` for no such chunk.
+    pub fn voxels(self, volume: &Volume) -> Option<VoxelBox> {
+        let level = volume.levels.get(self.level as usize)?;
+        let exists = (self.channel as usize) < volume.channels.len()
+            && self.chunk.cmplt(volume.chunks(self.level as usize)).all();
+        let min = exists.then(|| self.chunk * volume.chunk)?;
+        Some(VoxelBox::new(min, min.saturating_add(volume.chunk).min(level.extent)))
+    }
+}
+
+impl fmt::Display for ChunkId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "channel {} level {} chunk {}", self.channel, self.level, self.chunk)
+    }
+}
+
+/// What a source knows of a chunk.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Chunk {
+    /// The voxels, x fastest, always a full chunk's worth of bytes.
+    Voxels(Bytes),
+    /// Nothing was acquired there. Stays so until a [`Change`] touches it.
+    Empty,
+}
+
+/// Smallest and largest measured value of a box of voxels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ValueRange {
+    /// Smallest.
+    pub min: u16,
+    /// Largest.
+    pub max: u16,
+}
+
+/// Why a chunk could not be delivered.
+#[derive(Clone, Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ChunkError {
+    /// The volume has no such chunk: the caller's mistake.
+    #[error("the volume has no {id}")]
+    OutOfRange {
+        /// What was asked for.
+        id: ChunkId,
+    },
+    /// It cannot be built in time; ask again.
+    #[error("{id} is not ready")]
+    NotReady {
+        /// What was asked for.
+        id: ChunkId,
+        /// When to ask again.
+        retry_after: Duration,
+    },
+    /// Reading or building failed; see the source.
+    #[error("{id} could not be read")]
+    Failed {
+        /// What was asked for.
+        id: ChunkId,
+        /// Whether the same request may succeed later.
+        transient: bool,
+        /// What went wrong.
+        source: Arc<dyn std::error::Error + Send + Sync>,
+    },
+}
+
+impl ChunkError {
+    /// Whether the same request may succeed later.
+    pub fn is_transient(&self) -> bool {
+        match self {
+            Self::OutOfRange { .. } => false,
+            Self::NotReady { .. } => true,
+            Self::Failed { transient, .. } => *transient,
+        }
+    }
+}
+
+/// Why a source could not be opened.
+#[derive(Clone, Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SourceError {
+    /// There is no such volume.
+    #[error("there is no volume {name:?}; the volumes are: {}", known.join(", "))]
+    NoVolume {
+        /// As asked for.
+        name: String,
+        /// What there is.
+        known: Vec<String>,
+    },
+    /// The description could not be read or makes no sense.
+    #[error("cannot open {location}")]
+    Open {
+        /// What went wrong.
+        source: Arc<dyn std::error::Error + Send + Sync>,
+        /// File or address.
+        location: String,
+    },
+}
+
+/// Why voxels changed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
+pub enum ChangeReason {
+    /// A tile arrived, or arrived again.
+    Tile,
+    /// A tile moved.
+    Transform,
+    /// Anything may have changed: events were missed.
+    Missed,
+}
+
+/// Voxels that are no longer what they were.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Change {
+    /// The volume's revision after it.
+    pub revision: u64,
+    /// Where \[level-0 voxels\].
+    pub voxels: VoxelBox,
+    /// Why.
+    pub reason: ChangeReason,
+}
+
+/// A volume whose chunks can be asked for. Implementations pass [`crate::conformance`].
+pub trait VolumeSource: MaybeSend + MaybeSync {
+    /// What the volume is. Never changes for an open source.
+    fn volume(&self) -> &Arc<Volume>;
+
+    /// Reads or builds a chunk. Dropping the future cancels the request.
+    ///
+    /// A read that begins after [`Self::changes`] yielded a change sees that change.
+    ///
+    /// # Errors
+    ///
+    /// [`ChunkError`], of the future.
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>>;
+
+    /// Changes from now on, in order of revision, without gaps: where some were missed, one with
+    /// [`ChangeReason::Missed`] covers the whole volume.
+    fn changes(&self) -> BoxStream<'static, Change>;
+
+    /// Bounds of a chunk's measured values, if they are known without reading voxels.
+    fn value_range(&self, _id: ChunkId) -> Option<ValueRange> {
+        None
+    }
+}

@@ -1,0 +1,2 @@
+//! Makes the browser bundle.
+fn main() {}
