@@ -58,7 +58,11 @@ impl BrickId {
             && (level as usize) < MAX_LEVELS
             && brick.max_element() < MAX_BRICKS_PER_AXIS;
         if !fits {
-            return Err(BrickIdError { channel, level, brick });
+            return Err(BrickIdError {
+                channel,
+                level,
+                brick,
+            });
         }
         let mut bits = u64::from(channel);
         bits = bits << LEVEL_BITS | u64::from(level);
@@ -104,7 +108,13 @@ impl fmt::Debug for BrickId {
 
 impl fmt::Display for BrickId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "channel {} level {} brick {}", self.channel(), self.level(), self.brick())
+        write!(
+            f,
+            "channel {} level {} brick {}",
+            self.channel(),
+            self.level(),
+            self.brick()
+        )
     }
 }
 
@@ -139,6 +149,9 @@ mod tests {
         assert!(BrickId::new(0, MAX_LEVELS as u32, UVec3::ZERO).is_err());
         assert!(BrickId::new(0, 0, UVec3::new(0, 1 << 16, 0)).is_err());
         let largest = BrickId::new(0, 0, UVec3::new(62_499, 62_499, 7_812));
-        assert!(largest.is_ok(), "the 888 PB volume of Table 1 is addressable");
+        assert!(
+            largest.is_ok(),
+            "the 888 PB volume of Table 1 is addressable"
+        );
     }
 }

@@ -83,7 +83,11 @@ impl Camera {
     /// Turned about the target by degrees; pitch stops at the poles.
     pub fn orbited(self, yaw: f64, pitch: f64) -> Self {
         let yaw = (self.yaw + yaw).rem_euclid(360.0);
-        Self { yaw, pitch: (self.pitch + pitch).clamp(-89.9, 89.9), ..self }
+        Self {
+            yaw,
+            pitch: (self.pitch + pitch).clamp(-89.9, 89.9),
+            ..self
+        }
     }
 
     /// Moved so that what was seen at the target moves by `pixels` on an image of that height.
@@ -91,19 +95,31 @@ impl Camera {
         let axes = self.physical_from_eye_axes();
         let by = pixels * self.pixel_nm(self.distance_nm, image_height);
         let target = self.target.xyz - axes.x_axis * by.x - axes.y_axis * by.y;
-        Self { target: Point::new(target), ..self }
+        Self {
+            target: Point::new(target),
+            ..self
+        }
     }
 
     /// Closer by a factor above 1, farther by one below.
     pub fn zoomed(self, factor: f64) -> Self {
-        Self { distance_nm: (self.distance_nm / factor).clamp(1e-3, 1e15), ..self }
+        Self {
+            distance_nm: (self.distance_nm / factor).clamp(1e-3, 1e15),
+            ..self
+        }
     }
 }
 
 impl fmt::Display for Camera {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let DVec3 { x, y, z } = self.target.xyz;
-        let Self { yaw, pitch, distance_nm, fov, .. } = self;
+        let Self {
+            yaw,
+            pitch,
+            distance_nm,
+            fov,
+            ..
+        } = self;
         write!(f, "{yaw},{pitch},{distance_nm},{x},{y},{z},{fov}")
     }
 }
@@ -111,7 +127,9 @@ impl fmt::Display for Camera {
 impl FromStr for Camera {
     type Err = ParseCameraError;
     fn from_str(text: &str) -> Result<Self, ParseCameraError> {
-        let error = || ParseCameraError { text: text.to_owned() };
+        let error = || ParseCameraError {
+            text: text.to_owned(),
+        };
         let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
         let numbers = numbers.map_err(|_| error())?;
         let (yaw, pitch, distance_nm, target, fov) = match numbers[..] {
@@ -123,7 +141,13 @@ impl FromStr for Camera {
         if !finite || distance_nm <= 0.0 || pitch.abs() > 90.0 || !(fov > 0.0 && fov < 180.0) {
             return Err(error());
         }
-        Ok(Self { target: Point::new(target.into()), distance_nm, yaw, pitch, fov })
+        Ok(Self {
+            target: Point::new(target.into()),
+            distance_nm,
+            yaw,
+            pitch,
+            fov,
+        })
     }
 }
 
@@ -138,25 +162,43 @@ mod tests {
 
     #[test]
     fn looks_as_sections_are_drawn() {
-        let camera = Camera { yaw: 0.0, pitch: 0.0, ..Camera::around(&volume()) };
+        let camera = Camera {
+            yaw: 0.0,
+            pitch: 0.0,
+            ..Camera::around(&volume())
+        };
         let axes = camera.physical_from_eye_axes();
         assert!((axes.x_axis - DVec3::X).length() < 1e-12);
-        assert!((axes.y_axis - DVec3::Y).length() < 1e-12, "y runs down in image and volume");
+        assert!(
+            (axes.y_axis - DVec3::Y).length() < 1e-12,
+            "y runs down in image and volume"
+        );
         assert!((axes.z_axis - DVec3::Z).length() < 1e-12);
     }
 
     #[test]
     fn positive_yaw_moves_the_eye_right_and_positive_pitch_up() {
-        let front = Camera { yaw: 0.0, pitch: 0.0, ..Camera::around(&volume()) };
+        let front = Camera {
+            yaw: 0.0,
+            pitch: 0.0,
+            ..Camera::around(&volume())
+        };
         assert!(front.orbited(20.0, 0.0).eye().xyz.x > front.eye().xyz.x);
-        assert!(front.orbited(0.0, 20.0).eye().xyz.y < front.eye().xyz.y, "up is towards -y");
+        assert!(
+            front.orbited(0.0, 20.0).eye().xyz.y < front.eye().xyz.y,
+            "up is towards -y"
+        );
     }
 
     #[test]
     fn axes_are_right_handed_and_unit_everywhere() {
         for yaw in [0.0, 77.0, 180.0, 301.0] {
             for pitch in [-89.9, -10.0, 0.0, 60.0] {
-                let camera = Camera { yaw, pitch, ..Camera::around(&volume()) };
+                let camera = Camera {
+                    yaw,
+                    pitch,
+                    ..Camera::around(&volume())
+                };
                 let m = camera.physical_from_eye_axes();
                 assert!((m.determinant() - 1.0).abs() < 1e-9);
                 assert!((m.transpose() * m - DMat3::IDENTITY).abs_diff_eq(DMat3::ZERO, 1e-9));
@@ -168,14 +210,25 @@ mod tests {
     fn text_survives() {
         let camera = Camera::around(&volume()).orbited(11.5, -3.0);
         assert_eq!(camera.to_string().parse::<Camera>().unwrap(), camera);
-        for bad in ["", "1,2,3", "0,0,-5,0,0,0", "0,0,inf,0,0,0", "0,99,1,0,0,0", "0,0,1,0,0,0,180"] {
+        for bad in [
+            "",
+            "1,2,3",
+            "0,0,-5,0,0,0",
+            "0,0,inf,0,0,0",
+            "0,99,1,0,0,0",
+            "0,0,1,0,0,0,180",
+        ] {
             assert!(bad.parse::<Camera>().is_err(), "{bad:?}");
         }
     }
 
     #[test]
     fn panning_follows_the_hand() {
-        let camera = Camera { yaw: 0.0, pitch: 0.0, ..Camera::around(&volume()) };
+        let camera = Camera {
+            yaw: 0.0,
+            pitch: 0.0,
+            ..Camera::around(&volume())
+        };
         let image = DVec2::new(640.0, 480.0);
         let moved = camera.panned(DVec2::new(100.0, 0.0), image.y);
         // The old target now appears 100 pixels right of the centre.

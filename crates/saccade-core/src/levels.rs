@@ -42,16 +42,26 @@ impl Level {
 pub fn halving_levels(extent: UVec3, voxel_nm: DVec3) -> Vec<Level> {
     let relative = voxel_nm / voxel_nm.min_element();
     let longest = (extent.as_dvec3() * relative).max_element();
-    let mut levels = vec![Level { extent, downsampling: DVec3::ONE }];
+    let mut levels = vec![Level {
+        extent,
+        downsampling: DVec3::ONE,
+    }];
     let mut bricks = longest / f64::from(BRICK_EDGE);
     let mut down = UVec3::ONE;
     while bricks > 1.0 && levels.len() < MAX_LEVELS {
         let size = relative * down.as_dvec3();
         let halve = (size * 2.0).cmple(DVec3::splat(size.max_element()));
-        let halve = if halve.any() { halve } else { glam::BVec3::TRUE };
+        let halve = if halve.any() {
+            halve
+        } else {
+            glam::BVec3::TRUE
+        };
         down = UVec3::select(halve, down * 2, down);
         let extent = (extent.saturating_sub(UVec3::ONE) / down) + 1;
-        levels.push(Level { extent, downsampling: down.as_dvec3() });
+        levels.push(Level {
+            extent,
+            downsampling: down.as_dvec3(),
+        });
         bricks /= 2.0;
     }
     levels
@@ -73,14 +83,20 @@ mod tests {
             let levels = halving_levels(UVec3::new(xy, xy, z), DVec3::new(5.0, 5.0, 40.0));
             assert_eq!(levels.len(), count, "{xy} x {xy} x {z}");
             let coarsest = levels.last().unwrap().extent;
-            assert!(coarsest.max_element() <= BRICK_EDGE, "coarsest is {coarsest}");
+            assert!(
+                coarsest.max_element() <= BRICK_EDGE,
+                "coarsest is {coarsest}"
+            );
         }
     }
 
     #[test]
     fn anisotropy_shrinks_first() {
         let levels = halving_levels(UVec3::new(1025, 1024, 20), DVec3::new(4.6, 4.6, 45.0));
-        let down: Vec<_> = levels.iter().map(|l| l.downsampling.as_uvec3().to_array()).collect();
+        let down: Vec<_> = levels
+            .iter()
+            .map(|l| l.downsampling.as_uvec3().to_array())
+            .collect();
         assert_eq!(down[..4], [[1, 1, 1], [2, 2, 1], [4, 4, 1], [8, 8, 1]]);
         assert_eq!(down[4], [16, 16, 2]);
         assert_eq!(levels[1].extent, UVec3::new(513, 512, 20));
@@ -92,7 +108,10 @@ mod tests {
         let levels = halving_levels(UVec3::new(100, 100, 10), DVec3::new(1.0, 1.0, 10.0));
         let b = VoxelBox::new(UVec3::new(3, 4, 1), UVec3::new(5, 6, 2));
         let coarse = levels[1].box_from_voxels(b);
-        assert_eq!(coarse, VoxelBox::new(UVec3::new(1, 2, 1), UVec3::new(3, 3, 2)));
+        assert_eq!(
+            coarse,
+            VoxelBox::new(UVec3::new(1, 2, 1), UVec3::new(3, 3, 2))
+        );
         let back = levels[1].voxels_from_box(coarse);
         assert_eq!(back.intersection(b), b);
     }

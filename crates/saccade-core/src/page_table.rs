@@ -41,7 +41,10 @@ impl PageTableShape {
             let per_channel: u64 = levels.iter().map(|l| volume_of(shape.directory(l))).sum();
             per_channel * u64::from(channels)
         };
-        shapes.into_iter().find(|s| entries(s) <= SMALL_DIRECTORY).unwrap_or(shapes[3])
+        shapes
+            .into_iter()
+            .find(|s| entries(s) <= SMALL_DIRECTORY)
+            .unwrap_or(shapes[3])
     }
 
     /// Directory entries per axis of a level.
@@ -108,10 +111,18 @@ impl PageTables {
         let mut tables = Vec::with_capacity(levels.len());
         for (index, level) in (0..).zip(levels) {
             let bricks = bricks_of(level.extent);
-            BrickId::new(channels.saturating_sub(1), index, bricks.saturating_sub(UVec3::ONE))?;
+            BrickId::new(
+                channels.saturating_sub(1),
+                index,
+                bricks.saturating_sub(UVec3::ONE),
+            )?;
             let directory = shape.directory(level);
             let directory_base = u32::try_from(base).unwrap_or(u32::MAX);
-            tables.push(LevelTable { bricks, directory, directory_base });
+            tables.push(LevelTable {
+                bricks,
+                directory,
+                directory_base,
+            });
             base += volume_of(directory);
         }
         let entries = base * u64::from(channels);
@@ -119,7 +130,12 @@ impl PageTables {
             return Err(PageTableError::Directory { entries });
         }
         let entries_per_channel = u32::try_from(base).unwrap_or(u32::MAX);
-        Ok(Self { shape, channels, levels: tables, entries_per_channel })
+        Ok(Self {
+            shape,
+            channels,
+            levels: tables,
+            entries_per_channel,
+        })
     }
 
     /// `t` and `b_pt`.
@@ -180,7 +196,10 @@ mod tests {
             let levels = halving_levels(UVec3::new(xy, xy, z), DVec3::new(5.0, 5.0, 40.0));
             for ((depth, block_edge), size) in shapes.into_iter().zip(sizes) {
                 let directory = PageTableShape { depth, block_edge }.directory(&levels[0]);
-                assert_eq!(directory.x, size, "{xy}^2 x {z}, t = {depth}, b_pt = {block_edge}");
+                assert_eq!(
+                    directory.x, size,
+                    "{xy}^2 x {z}, t = {depth}, b_pt = {block_edge}"
+                );
             }
         }
     }
@@ -190,7 +209,10 @@ mod tests {
         let levels = halving_levels(UVec3::new(700, 530, 610), DVec3::new(1.0, 1.0, 3.0));
         for depth in [2, 3] {
             // Blocks of 4 are smaller than any in use, so that many blocks and edges are met.
-            let shape = PageTableShape { depth, block_edge: 4 };
+            let shape = PageTableShape {
+                depth,
+                block_edge: 4,
+            };
             let tables = PageTables::new(&levels, 2, shape).unwrap();
             let mut seen = std::collections::HashSet::new();
             for (level, table) in (0..).zip(tables.levels()) {
@@ -212,10 +234,14 @@ mod tests {
     #[test]
     fn small_volumes_take_two_steps_and_large_ones_three() {
         let nm = DVec3::new(5.0, 5.0, 40.0);
-        let shape = |x, z| {
-            PageTableShape::for_volume(&halving_levels(UVec3::new(x, x, z), nm), 1)
-        };
-        assert_eq!(shape(32_768, 4_096), PageTableShape { depth: 2, block_edge: 16 });
+        let shape = |x, z| PageTableShape::for_volume(&halving_levels(UVec3::new(x, x, z), nm), 1);
+        assert_eq!(
+            shape(32_768, 4_096),
+            PageTableShape {
+                depth: 2,
+                block_edge: 16
+            }
+        );
         assert_eq!(shape(2_000_000, 250_000).depth, 3);
     }
 }

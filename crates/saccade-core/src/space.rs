@@ -32,7 +32,10 @@ pub struct Point<S> {
 impl<S> Point<S> {
     /// The position with these coordinates.
     pub const fn new(xyz: DVec3) -> Self {
-        Self { xyz, space: PhantomData }
+        Self {
+            xyz,
+            space: PhantomData,
+        }
     }
 }
 
@@ -63,12 +66,18 @@ pub struct Map<To, From> {
 impl<To, From> Map<To, From> {
     /// The map that scales each axis about the origin.
     pub fn scale(by: DVec3) -> Self {
-        Self { affine: DAffine3::from_scale(by), spaces: PhantomData }
+        Self {
+            affine: DAffine3::from_scale(by),
+            spaces: PhantomData,
+        }
     }
 
     /// The map in the other direction.
     pub fn inverse(self) -> Map<From, To> {
-        Map { affine: self.affine.inverse(), spaces: PhantomData }
+        Map {
+            affine: self.affine.inverse(),
+            spaces: PhantomData,
+        }
     }
 
     /// Maps a direction: translations do not apply. The result is not normalised.
@@ -99,7 +108,10 @@ impl<A, B> Mul<Point<B>> for Map<A, B> {
 impl<A, B, C> Mul<Map<B, C>> for Map<A, B> {
     type Output = Map<A, C>;
     fn mul(self, rhs: Map<B, C>) -> Map<A, C> {
-        Map { affine: self.affine * rhs.affine, spaces: PhantomData }
+        Map {
+            affine: self.affine * rhs.affine,
+            spaces: PhantomData,
+        }
     }
 }
 

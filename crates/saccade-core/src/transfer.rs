@@ -40,13 +40,17 @@ pub struct TransferFunction {
 impl TransferFunction {
     /// Opacity of a value in `[0, 1]`.
     pub fn opacity_at(&self, value: f32) -> f32 {
-        let Some(first) = self.opacity.first() else { return 0.0 };
+        let Some(first) = self.opacity.first() else {
+            return 0.0;
+        };
         let next = self.opacity.partition_point(|p| p.value <= value);
         if next == 0 {
             return first.opacity;
         }
         let a = self.opacity[next - 1];
-        let Some(b) = self.opacity.get(next) else { return a.opacity };
+        let Some(b) = self.opacity.get(next) else {
+            return a.opacity;
+        };
         let t = (value - a.value) / (b.value - a.value);
         a.opacity + t * (b.opacity - a.opacity)
     }
@@ -55,7 +59,11 @@ impl TransferFunction {
     pub fn color_at(&self, value: f32) -> [f32; 3] {
         let [low, high] = self.window;
         let span = high - low;
-        let t = if span.abs() < 1e-6 { f32::from(value >= low) } else { (value - low) / span };
+        let t = if span.abs() < 1e-6 {
+            f32::from(value >= low)
+        } else {
+            (value - low) / span
+        };
         self.color_map.linear_rgb(t.clamp(0.0, 1.0))
     }
 
@@ -68,7 +76,11 @@ impl TransferFunction {
         for (stored, entry) in (0..=u8::MAX).zip(&mut table) {
             let value = f32::from(self.polarity.stored(stored)) / 255.0;
             let [r, g, b] = self.color_at(value);
-            let opacity = if stored == 0 { 0.0 } else { self.opacity_at(value).clamp(0.0, 0.999) };
+            let opacity = if stored == 0 {
+                0.0
+            } else {
+                self.opacity_at(value).clamp(0.0, 0.999)
+            };
             *entry = [r, g, b, opacity];
         }
         table
@@ -82,7 +94,11 @@ pub fn opacity_of_length(opacity: f64, length: f64, reference: f64) -> f64 {
 
 /// Linear light from an sRGB value, both in `[0, 1]`.
 pub fn linear_from_srgb(srgb: f32) -> f32 {
-    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+    if srgb <= 0.040_45 {
+        srgb / 12.92
+    } else {
+        ((srgb + 0.055) / 1.055).powf(2.4)
+    }
 }
 
 #[cfg(test)]
@@ -112,7 +128,10 @@ mod tests {
     fn nothing_acquired_is_transparent() {
         let table = ramp().table();
         assert_eq!(table[0][3], 0.0, "value 0 would be opaque");
-        assert!(table[255][3] > 0.7, "the darkest measured value is stored as 255");
+        assert!(
+            table[255][3] > 0.7,
+            "the darkest measured value is stored as 255"
+        );
         assert_eq!(table[1][3], 0.0);
     }
 

@@ -80,7 +80,12 @@ impl SectionFromTile {
 
     /// Bounds `(min, max)` in the section of a tile of `size` pixels.
     pub fn bounds(self, size: DVec2) -> (SectionPoint, SectionPoint) {
-        let corners = [DVec2::ZERO, DVec2::new(size.x, 0.0), DVec2::new(0.0, size.y), size];
+        let corners = [
+            DVec2::ZERO,
+            DVec2::new(size.x, 0.0),
+            DVec2::new(0.0, size.y),
+            size,
+        ];
         let corners = corners.map(|c| self.apply(TilePoint(c)).0);
         let min = corners.into_iter().fold(DVec2::INFINITY, DVec2::min);
         let max = corners.into_iter().fold(DVec2::NEG_INFINITY, DVec2::max);
@@ -139,8 +144,14 @@ mod tests {
     #[test]
     fn elements_are_in_the_order_of_trakem2() {
         let t = SectionFromTile::new([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).unwrap();
-        assert_eq!(t.apply(TilePoint(DVec2::new(1.0, 0.0))).0, DVec2::new(6.0, 8.0));
-        assert_eq!(t.apply(TilePoint(DVec2::new(0.0, 1.0))).0, DVec2::new(8.0, 10.0));
+        assert_eq!(
+            t.apply(TilePoint(DVec2::new(1.0, 0.0))).0,
+            DVec2::new(6.0, 8.0)
+        );
+        assert_eq!(
+            t.apply(TilePoint(DVec2::new(0.0, 1.0))).0,
+            DVec2::new(8.0, 10.0)
+        );
         let json = serde_json::to_string(&t).unwrap();
         assert_eq!(json, "[1.0,2.0,3.0,4.0,5.0,6.0]");
         assert_eq!(serde_json::from_str::<SectionFromTile>(&json).unwrap(), t);

@@ -16,7 +16,10 @@ pub struct VoxelBox {
 
 impl VoxelBox {
     /// No voxels.
-    pub const EMPTY: Self = Self { min: UVec3::ZERO, max: UVec3::ZERO };
+    pub const EMPTY: Self = Self {
+        min: UVec3::ZERO,
+        max: UVec3::ZERO,
+    };
 
     /// The box from `min` up to, not including, `max`.
     pub const fn new(min: UVec3, max: UVec3) -> Self {
@@ -25,7 +28,10 @@ impl VoxelBox {
 
     /// The box of `size` voxels at the origin.
     pub const fn of_size(size: UVec3) -> Self {
-        Self { min: UVec3::ZERO, max: size }
+        Self {
+            min: UVec3::ZERO,
+            max: size,
+        }
     }
 
     /// The smallest box of whole voxels around real bounds, cut at zero and at `u32::MAX`.
@@ -36,7 +42,10 @@ impl VoxelBox {
             return Self::EMPTY;
         }
         // `as` saturates: exactly the cut that is wanted.
-        Self { min: min.floor().as_uvec3(), max: max.ceil().as_uvec3() }
+        Self {
+            min: min.floor().as_uvec3(),
+            max: max.ceil().as_uvec3(),
+        }
     }
 
     /// Whether it holds no voxel.
@@ -57,7 +66,10 @@ impl VoxelBox {
 
     /// The voxels in both.
     pub fn intersection(self, other: Self) -> Self {
-        Self { min: self.min.max(other.min), max: self.max.min(other.max) }
+        Self {
+            min: self.min.max(other.min),
+            max: self.max.min(other.max),
+        }
     }
 
     /// Whether any voxel is in both.
@@ -72,7 +84,10 @@ impl VoxelBox {
         } else if other.is_empty() {
             self
         } else {
-            Self { min: self.min.min(other.min), max: self.max.max(other.max) }
+            Self {
+                min: self.min.min(other.min),
+                max: self.max.max(other.max),
+            }
         }
     }
 
@@ -87,7 +102,10 @@ impl VoxelBox {
             return self;
         }
         let by = UVec3::splat(by);
-        Self { min: self.min.saturating_sub(by), max: self.max.saturating_add(by) }
+        Self {
+            min: self.min.saturating_sub(by),
+            max: self.max.saturating_add(by),
+        }
     }
 
     /// The grid cells of edge `cell` that it touches, x fastest.
@@ -95,7 +113,10 @@ impl VoxelBox {
         let cells = if self.is_empty() {
             Self::EMPTY
         } else {
-            Self { min: self.min / cell, max: (self.max - 1) / cell + 1 }
+            Self {
+                min: self.min / cell,
+                max: (self.max - 1) / cell + 1,
+            }
         };
         cells.iter()
     }
@@ -123,9 +144,15 @@ mod tests {
     fn empty_boxes_stay_empty() {
         let a = VoxelBox::new(UVec3::new(5, 0, 0), UVec3::new(3, 9, 9));
         assert!(a.is_empty());
-        assert_eq!((a.voxels(), a.iter().count(), a.cells(UVec3::ONE).count()), (0, 0, 0));
+        assert_eq!(
+            (a.voxels(), a.iter().count(), a.cells(UVec3::ONE).count()),
+            (0, 0, 0)
+        );
         assert!(a.grown(4).is_empty());
-        assert_eq!(a.union(VoxelBox::of_size(UVec3::ONE)), VoxelBox::of_size(UVec3::ONE));
+        assert_eq!(
+            a.union(VoxelBox::of_size(UVec3::ONE)),
+            VoxelBox::of_size(UVec3::ONE)
+        );
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! A first transfer function from a histogram, so that the first look shows structure.
 
+use glam::DVec3;
+
 use super::{ColorMap, OpacityPoint, TransferFunction};
 use crate::volume::Polarity;
 
@@ -51,18 +53,25 @@ impl Histogram {
     /// bright tissue; labelled cells the bright tail of a dark field.
     pub fn polarity(&self) -> Polarity {
         let [low, middle, high] = [0.02, 0.5, 0.98].map(|p| i32::from(self.percentile(p)));
-        if middle - low > high - middle { Polarity::Dark } else { Polarity::Bright }
+        if middle - low > high - middle {
+            Polarity::Dark
+        } else {
+            Polarity::Bright
+        }
     }
 
     /// A transfer function that shows the tail of the distribution and hides its bulk.
     ///
-    /// `size_nm` is the longest side of the volume: opacity is chosen so that a ray sees some
-    /// depth of it. An empty histogram gives a plain ramp over all values.
-    pub fn transfer_function(&self, size_nm: f64) -> TransferFunction {
+    /// `size_nm` is the volume's size \[nm\]: opacity is chosen so that a ray sees some depth of a
+    /// block and a thin slab is still seen. An empty histogram gives a plain ramp over all values.
+    pub fn transfer_function(&self, size_nm: DVec3) -> TransferFunction {
         let polarity = self.polarity();
         let unit = |v: u8| f32::from(v) / 255.0;
-        let [low, high] =
-            if self.total() == 0 { [0.0, 1.0] } else { [0.005, 0.995].map(|p| unit(self.percentile(p))) };
+        let [low, high] = if self.total() == 0 {
+            [0.0, 1.0]
+        } else {
+            [0.005, 0.995].map(|p| unit(self.percentile(p)))
+        };
         let high = high.max(low + 2.0 / 255.0);
         let point = |value, opacity| OpacityPoint { value, opacity };
         let opacity = match polarity {
@@ -81,7 +90,7 @@ impl Histogram {
             color_map: ColorMap::Gray,
             window: [low, high],
             opacity,
-            opacity_length_nm: size_nm / 64.0,
+            opacity_length_nm: (size_nm.max_element() / 64.0).min(size_nm.min_element() / 2.0),
         }
     }
 }
@@ -103,15 +112,22 @@ mod tests {
     #[test]
     fn em_is_dark_on_bright_and_fluorescence_is_not() {
         let em = bell(170.0, 20.0, 80.0);
-        let tf = em.transfer_function(1000.0);
+        let tf = em.transfer_function(DVec3::splat(1000.0));
         assert_eq!(tf.polarity, Polarity::Dark);
         assert!(tf.opacity_at(80.0 / 255.0) > 0.5, "membranes are seen");
         assert!(tf.opacity_at(175.0 / 255.0) < 0.05, "cytoplasm is not");
 
         let fluorescence = bell(30.0, 10.0, 160.0);
-        let tf = fluorescence.transfer_function(1000.0);
+        let tf = fluorescence.transfer_function(DVec3::splat(1000.0));
         assert_eq!(tf.polarity, Polarity::Bright);
         assert!(tf.opacity_at(160.0 / 255.0) > 0.5 && tf.opacity_at(20.0 / 255.0) < 0.05);
+    }
+
+    #[test]
+    fn a_thin_slab_is_seen() {
+        let tf = bell(30.0, 10.0, 160.0).transfer_function(DVec3::new(4e5, 2e5, 600.0));
+        let slab = super::super::opacity_of_length(0.8, 600.0, tf.opacity_length_nm);
+        assert!(slab > 0.9, "three sections across show only {slab}");
     }
 
     #[test]
@@ -119,8 +135,12 @@ mod tests {
         let mut constant = Histogram::default();
         constant.add(&[255; 100]);
         for histogram in [Histogram::default(), constant] {
-            let tf = histogram.transfer_function(1.0);
-            assert!(tf.opacity.windows(2).all(|p| p[0].value < p[1].value), "{:?}", tf.opacity);
+            let tf = histogram.transfer_function(DVec3::ONE);
+            assert!(
+                tf.opacity.windows(2).all(|p| p[0].value < p[1].value),
+                "{:?}",
+                tf.opacity
+            );
             assert!(tf.window[0] < tf.window[1]);
         }
     }

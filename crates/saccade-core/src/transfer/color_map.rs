@@ -25,20 +25,34 @@ pub enum ColorMap {
 
 impl ColorMap {
     /// Every map, in the order menus show them.
-    pub const ALL: [Self; 6] =
-        [Self::Gray, Self::Bone, Self::Viridis, Self::Inferno, Self::Green, Self::Magenta];
+    pub const ALL: [Self; 6] = [
+        Self::Gray,
+        Self::Bone,
+        Self::Viridis,
+        Self::Inferno,
+        Self::Green,
+        Self::Magenta,
+    ];
 
     /// Evenly spaced corners, sRGB bytes.
     const fn corners(self) -> &'static [[u8; 3]] {
         match self {
             Self::Gray => &[[0, 0, 0], [255, 255, 255]],
             Self::Bone => &[[0, 0, 0], [84, 84, 116], [168, 199, 199], [255, 255, 255]],
-            Self::Viridis => {
-                &[[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]]
-            }
-            Self::Inferno => {
-                &[[0, 0, 4], [87, 16, 110], [188, 55, 84], [249, 142, 9], [252, 255, 164]]
-            }
+            Self::Viridis => &[
+                [68, 1, 84],
+                [59, 82, 139],
+                [33, 145, 140],
+                [94, 201, 98],
+                [253, 231, 37],
+            ],
+            Self::Inferno => &[
+                [0, 0, 4],
+                [87, 16, 110],
+                [188, 55, 84],
+                [249, 142, 9],
+                [252, 255, 164],
+            ],
             Self::Green => &[[0, 0, 0], [0, 255, 0]],
             Self::Magenta => &[[0, 0, 0], [255, 0, 255]],
         }
@@ -70,6 +84,9 @@ mod tests {
     fn ends_and_corners_are_exact() {
         assert_eq!(ColorMap::Gray.srgb(0.0), [0.0; 3]);
         assert_eq!(ColorMap::Gray.srgb(1.0), [1.0; 3]);
-        assert_eq!(ColorMap::Viridis.srgb(0.5), [33, 145, 140].map(|v: u8| f32::from(v) / 255.0));
+        assert_eq!(
+            ColorMap::Viridis.srgb(0.5),
+            [33, 145, 140].map(|v: u8| f32::from(v) / 255.0)
+        );
     }
 }
