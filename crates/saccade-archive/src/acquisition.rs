@@ -1,0 +1,233 @@
+//! The acquisition archive: where a microscope writes, and the formats in which it says what.
+//!
+//! A folder with
+//!
+//! - `volume.json`: [`AcquisitionInfo`], written once, before the first tile;
+//! - `tiles.jsonl`: one [`Record`] per line, only ever appended to;
+//! - image files, named by the records, relative to the folder.
+//!
+//! Other people's formats become the same words: [`tile_list`] reads plain `file x y z` lists,
+//! [`trakem2`] the affine transforms of a TrakEM2 project.
+//!
+//! Reading never changes the archive. Unknown fields are ignored, so that a microscope may say
+//! more than is understood here.
+
+mod record;
+pub mod tile_list;
+pub mod trakem2;
+
+use std::fs;
+use std::io;
+use std::path::{Component, Path, PathBuf};
+
+use glam::{DVec3, UVec3};
+use saccade_core::volume::{Volume, VolumeError};
+use serde::{Deserialize, Serialize};
+
+pub use record::{
+    BrokenRecord, Cursor, Record, RecordLine, RecordReader, RecordWriter, TileRecord,
+    TransformRecord,
+};
+
+/// Why an acquisition archive, or a file that describes one, could not be used.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum AcquisitionError {
+    /// A file or folder could not be read.
+    #[error("cannot read {}; check that it exists and that you may read it", path.display())]
+    Read {
+        /// What the system says.
+        source: io::Error,
+        /// File or folder.
+        path: PathBuf,
+    },
+    /// A file could not be written.
+    #[error("cannot write {}; check the folder's permissions and its free space", path.display())]
+    Write {
+        /// What the system says.
+        source: io::Error,
+        /// File.
+        path: PathBuf,
+    },
+    /// The folder holds no `volume.json`.
+    #[error(
+        "this folder is no acquisition archive: it has no {}; the microscope's software writes it \
+         before the first tile, and so does `saccade simulate`: {}",
+        AcquisitionInfo::FILE, path.display()
+    )]
+    NoInfo {
+        /// Folder.
+        path: PathBuf,
+    },
+    /// `volume.json` is not what it should be.
+    #[error(
+        "cannot understand {}; it should hold {{\"name\": .., \"extent\": [x, y, z], \
+         \"voxel_nm\": [x, y, z]}}",
+        path.display()
+    )]
+    Info {
+        /// Where it stops making sense.
+        source: serde_json::Error,
+        /// File.
+        path: PathBuf,
+    },
+    /// The records were cut or replaced, although they are only ever appended to.
+    #[error(
+        "the records end at byte {len}, but were read up to byte {read} before; records are only \
+         ever appended: restore the file, or ingest into a new volume: {}",
+        path.display()
+    )]
+    RecordsCut {
+        /// Length of the file \[bytes\].
+        len: u64,
+        /// What was read earlier \[bytes\].
+        read: u64,
+        /// File.
+        path: PathBuf,
+    },
+    /// A line of a text file makes no sense.
+    #[error("line {line}: {reason}: {}", path.display())]
+    Line {
+        /// Line, from 1.
+        line: u64,
+        /// What is wrong with it.
+        reason: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// An XML file makes no sense.
+    #[error("cannot understand the TrakEM2 project {}", path.display())]
+    Xml {
+        /// Where it stops making sense.
+        source: roxmltree::Error,
+        /// File.
+        path: PathBuf,
+    },
+}
+
+/// What is acquired: the content of `volume.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AcquisitionInfo {
+    /// Name of the volume.
+    pub name: String,
+    /// Size, also of what will come later \[level-0 voxels\].
+    pub extent: UVec3,
+    /// Voxel size \[nm\].
+    pub voxel_nm: DVec3,
+}
+
+impl AcquisitionInfo {
+    /// The file's name in the archive.
+    pub const FILE: &str = "volume.json";
+
+    /// Reads it from an acquisition archive.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::NoInfo`], [`AcquisitionError::Read`], [`AcquisitionError::Info`].
+    pub fn read(folder: &Path) -> Result<Self, AcquisitionError> {
+        let path = folder.join(Self::FILE);
+        // The folder first: "you may not look in here" is not "there is nothing here".
+        fs::read_dir(folder).map_err(|source| AcquisitionError::Read {
+            source,
+            path: folder.to_owned(),
+        })?;
+        let text = match fs::read(&path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == io::ErrorKind::NotFound => {
+                return Err(AcquisitionError::NoInfo {
+                    path: folder.to_owned(),
+                });
+            }
+            Err(source) => return Err(AcquisitionError::Read { source, path }),
+        };
+        serde_json::from_slice(&text).map_err(|source| AcquisitionError::Info { source, path })
+    }
+
+    /// Writes it into an acquisition archive, whole or not at all. The folder is made if missing.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::Write`].
+    pub fn write(&self, folder: &Path) -> Result<(), AcquisitionError> {
+        let path = folder.join(Self::FILE);
+        let temporary = folder.join(concat!("volume.json", ".part"));
+        let text = serde_json::to_vec_pretty(self).expect("numbers and a string become JSON");
+        fs::create_dir_all(folder)
+            .and_then(|()| fs::write(&temporary, text))
+            .and_then(|()| fs::rename(&temporary, &path))
+            .map_err(|source| AcquisitionError::Write { source, path })
+    }
+
+    /// The volume it describes.
+    ///
+    /// # Errors
+    ///
+    /// [`VolumeError`] for an empty extent or an impossible voxel size.
+    pub fn volume(&self) -> Result<Volume, VolumeError> {
+        Volume::new(&self.name, self.extent, self.voxel_nm)
+    }
+}
+
+/// The path of an image that a record names, or `None` if the name leads out of the archive.
+pub fn image_path(folder: &Path, file: &str) -> Option<PathBuf> {
+    let file = Path::new(file);
+    let inside = file
+        .components()
+        .all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+    (inside && file.file_name().is_some()).then(|| folder.join(file))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn info_survives_its_file_and_more_fields() {
+        let folder = tempfile::tempdir().unwrap();
+        let info = AcquisitionInfo {
+            name: "cortex".to_owned(),
+            extent: UVec3::new(10, 20, 3),
+            voxel_nm: DVec3::new(4.0, 4.0, 40.0),
+        };
+        info.write(&folder.path().join("new")).unwrap();
+        assert_eq!(
+            AcquisitionInfo::read(&folder.path().join("new")).unwrap(),
+            info
+        );
+
+        let more = r#"{"name":"cortex","extent":[10,20,3],"voxel_nm":[4,4,40],"kV":1.5}"#;
+        fs::write(folder.path().join(AcquisitionInfo::FILE), more).unwrap();
+        assert_eq!(AcquisitionInfo::read(folder.path()).unwrap(), info);
+    }
+
+    #[test]
+    fn what_is_missing_or_broken_is_said() {
+        let folder = tempfile::tempdir().unwrap();
+        let read = |path: &Path| AcquisitionInfo::read(path).unwrap_err();
+        assert!(matches!(
+            read(&folder.path().join("none")),
+            AcquisitionError::Read { .. }
+        ));
+        assert!(matches!(
+            read(folder.path()),
+            AcquisitionError::NoInfo { .. }
+        ));
+        fs::write(folder.path().join(AcquisitionInfo::FILE), r#"{"name":"x"}"#).unwrap();
+        assert!(matches!(read(folder.path()), AcquisitionError::Info { .. }));
+    }
+
+    #[test]
+    fn images_stay_inside_the_archive() {
+        let folder = Path::new("/archive");
+        let inside = |file| image_path(folder, file);
+        assert_eq!(
+            inside("tiles/a.tif").unwrap(),
+            Path::new("/archive/tiles/a.tif")
+        );
+        assert!(inside("./a.tif").is_some());
+        for out in ["/etc/passwd", "../a.tif", "tiles/../../a.tif", "", "."] {
+            assert_eq!(inside(out), None, "{out}");
+        }
+    }
+}

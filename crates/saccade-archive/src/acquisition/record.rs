@@ -1,0 +1,400 @@
+//! Records: what the microscope says of its tiles, one JSON object per line.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use glam::UVec2;
+use saccade_core::transform::SectionFromTile;
+use serde::{Deserialize, Serialize};
+
+use super::AcquisitionError;
+
+/// Bytes a line may have; a longer one is broken.
+const MAX_LINE: usize = 1 << 16;
+
+/// One line of `tiles.jsonl`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "record", rename_all = "lowercase")]
+pub enum Record {
+    /// A tile was acquired, for the first time or again.
+    Tile(TileRecord),
+    /// A tile lies elsewhere than said before. May come before its tile.
+    Transform(TransformRecord),
+}
+
+/// A tile was acquired.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TileRecord {
+    /// The tile's name, unique in the volume. The same name again replaces the tile.
+    pub tile: String,
+    /// The image, relative to the archive's folder.
+    pub file: String,
+    /// Section: z index of the volume.
+    pub section: u32,
+    /// Width and height \[pixels\].
+    pub size: UVec2,
+    /// Where the stage says it lies: to level-0 voxels from pixels.
+    pub transform: SectionFromTile,
+}
+
+/// A tile's transform changed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TransformRecord {
+    /// The tile's name.
+    pub tile: String,
+    /// To level-0 voxels from pixels.
+    pub transform: SectionFromTile,
+}
+
+/// How far the records were read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Cursor {
+    /// Where the next line begins \[bytes\].
+    pub offset: u64,
+    /// Lines before it.
+    pub line: u64,
+}
+
+/// A line that is no record.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("line {line} is no record: {reason}")]
+pub struct BrokenRecord {
+    /// Line, from 1.
+    pub line: u64,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+/// A line as it was read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RecordLine {
+    /// Where the line begins \[bytes\]. Names the record for good: records are only appended.
+    pub offset: u64,
+    /// The reader's position after it.
+    pub next: Cursor,
+    /// What it says.
+    pub record: Result<Record, BrokenRecord>,
+}
+
+/// Reads records as they are appended, from a cursor on.
+#[derive(Debug)]
+pub struct RecordReader {
+    path: PathBuf,
+    cursor: Cursor,
+}
+
+impl RecordReader {
+    /// The file's name in the archive.
+    pub const FILE: &str = "tiles.jsonl";
+
+    /// A reader of an acquisition archive's records after `cursor`. Nothing is opened yet.
+    pub fn new(folder: &Path, cursor: Cursor) -> Self {
+        Self {
+            path: folder.join(Self::FILE),
+            cursor,
+        }
+    }
+
+    /// Where the next line begins.
+    pub fn cursor(&self) -> Cursor {
+        self.cursor
+    }
+
+    /// The next whole lines, at most `max`; empty lines are skipped. None if there is no file yet.
+    ///
+    /// A last line without its line feed is still being written, and is left for later.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::Read`], and [`AcquisitionError::RecordsCut`] for a file that got shorter.
+    pub fn read(&mut self, max: usize) -> Result<Vec<RecordLine>, AcquisitionError> {
+        self.read_lines(max)
+            .map_err(|source| AcquisitionError::Read {
+                source,
+                path: self.path.clone(),
+            })?
+    }
+
+    /// Bytes not yet read.
+    pub fn remaining(&self) -> u64 {
+        let len = std::fs::metadata(&self.path).map_or(0, |m| m.len());
+        len.saturating_sub(self.cursor.offset)
+    }
+
+    fn read_lines(&mut self, max: usize) -> io::Result<Result<Vec<RecordLine>, AcquisitionError>> {
+        let mut file = match File::open(&self.path) {
+            Ok(file) => file,
+            Err(e) if e.kind() == io::ErrorKind::NotFound && self.cursor.offset == 0 => {
+                return Ok(Ok(Vec::new()));
+            }
+            Err(e) => return Err(e),
+        };
+        let len = file.metadata()?.len();
+        if len < self.cursor.offset {
+            let read = self.cursor.offset;
+            return Ok(Err(AcquisitionError::RecordsCut {
+                len,
+                read,
+                path: self.path.clone(),
+            }));
+        }
+        file.seek(SeekFrom::Start(self.cursor.offset))?;
+        let mut file = BufReader::new(file);
+        let mut lines = Vec::new();
+        let mut text = Vec::new();
+        while lines.len() < max {
+            text.clear();
+            let read = read_line(&mut file, &mut text)?;
+            if !read.ended {
+                break;
+            }
+            let offset = self.cursor.offset;
+            self.cursor = Cursor {
+                offset: offset + read.bytes,
+                line: self.cursor.line + 1,
+            };
+            if text.iter().all(u8::is_ascii_whitespace) {
+                continue;
+            }
+            let record = if read.bytes > MAX_LINE as u64 {
+                Err(format!("it has {} bytes, more than {MAX_LINE}", read.bytes))
+            } else {
+                serde_json::from_slice(&text).map_err(|e| e.to_string())
+            };
+            let line = self.cursor.line;
+            let record = record.map_err(|reason| BrokenRecord { line, reason });
+            lines.push(RecordLine {
+                offset,
+                next: self.cursor,
+                record,
+            });
+        }
+        Ok(Ok(lines))
+    }
+}
+
+struct Line {
+    bytes: u64,
+    ended: bool,
+}
+
+/// Reads up to and including a line feed, but keeps no more than the longest sensible line.
+fn read_line(file: &mut impl BufRead, text: &mut Vec<u8>) -> io::Result<Line> {
+    let mut line = Line {
+        bytes: 0,
+        ended: false,
+    };
+    while !line.ended {
+        let mut part = Vec::new();
+        file.by_ref()
+            .take(MAX_LINE as u64)
+            .read_until(b'\n', &mut part)?;
+        if part.is_empty() {
+            break;
+        }
+        line.bytes += part.len() as u64;
+        line.ended = part.ends_with(b"\n");
+        if text.len() < MAX_LINE {
+            text.append(&mut part);
+        }
+    }
+    Ok(line)
+}
+
+/// The microscope's side: appends records.
+#[derive(Debug)]
+pub struct RecordWriter {
+    file: File,
+    path: PathBuf,
+}
+
+impl RecordWriter {
+    /// Opens an archive's records for appending. Folder and file are made if missing.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::Write`].
+    pub fn open(folder: &Path) -> Result<Self, AcquisitionError> {
+        let path = folder.join(RecordReader::FILE);
+        let open = || {
+            std::fs::create_dir_all(folder)?;
+            let mut file = OpenOptions::new()
+                .read(true)
+                .append(true)
+                .create(true)
+                .open(&path)?;
+            // A writer that died in a line must not spoil the next record.
+            if file.seek(SeekFrom::End(0))? > 0 {
+                file.seek(SeekFrom::End(-1))?;
+                let mut last = [0];
+                file.read_exact(&mut last)?;
+                if last != *b"\n" {
+                    file.write_all(b"\n")?;
+                }
+            }
+            Ok(file)
+        };
+        match open() {
+            Ok(file) => Ok(Self { file, path }),
+            Err(source) => Err(AcquisitionError::Write { source, path }),
+        }
+    }
+
+    /// Appends a record in a single write.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::Write`].
+    pub fn append(&mut self, record: &Record) -> Result<(), AcquisitionError> {
+        let mut line = serde_json::to_vec(record).expect("numbers and strings become JSON");
+        line.push(b'\n');
+        let written = self.file.write_all(&line).and_then(|()| self.file.flush());
+        written.map_err(|source| AcquisitionError::Write {
+            source,
+            path: self.path.clone(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec2;
+
+    fn tile(name: &str) -> Record {
+        Record::Tile(TileRecord {
+            tile: name.to_owned(),
+            file: format!("tiles/{name}.tif"),
+            section: 3,
+            size: UVec2::new(300, 260),
+            transform: SectionFromTile::translation(DVec2::new(10.0, -2.5)),
+        })
+    }
+
+    fn records(lines: &[RecordLine]) -> Vec<Record> {
+        lines.iter().map(|l| l.record.clone().unwrap()).collect()
+    }
+
+    #[test]
+    fn the_text_is_the_documented_one() {
+        let json = serde_json::to_string(&tile("a")).unwrap();
+        let want = r#"{"record":"tile","tile":"a","file":"tiles/a.tif","section":3,"size":[300,260],"transform":[1.0,0.0,0.0,1.0,10.0,-2.5]}"#;
+        assert_eq!(json, want);
+        let moved = r#"{"record":"transform","by":"someone","tile":"a","transform":[1,0,0,1,2,3]}"#;
+        let Record::Transform(moved) = serde_json::from_str(moved).unwrap() else {
+            panic!("not a transform")
+        };
+        assert_eq!(moved.transform.elements(), [1.0, 0.0, 0.0, 1.0, 2.0, 3.0]);
+    }
+
+    #[test]
+    fn a_half_line_waits_for_its_end() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut reader = RecordReader::new(folder.path(), Cursor::default());
+        assert_eq!(reader.read(9).unwrap(), [], "no file yet");
+
+        let mut writer = RecordWriter::open(folder.path()).unwrap();
+        writer.append(&tile("a")).unwrap();
+        let text = serde_json::to_string(&tile("b")).unwrap();
+        // Every place at which a writer may be interrupted.
+        for cut in 0..text.len() {
+            let (head, tail) = text.split_at(cut);
+            writer.file.write_all(head.as_bytes()).unwrap();
+            let mut reader = RecordReader::new(folder.path(), reader.cursor());
+            let before = reader.read(9).unwrap();
+            writer.file.write_all(tail.as_bytes()).unwrap();
+            writer.file.write_all(b"\n").unwrap();
+            let mut all = records(&before);
+            all.extend(records(&reader.read(usize::MAX).unwrap()));
+            assert_eq!(all.len(), cut + 2, "cut at {cut}");
+        }
+        let all = reader.read(usize::MAX).unwrap();
+        let last = all.last().unwrap();
+        assert_eq!(last.next, reader.cursor());
+        assert_eq!(last.next.line, text.len() as u64 + 1);
+        assert_eq!(reader.remaining(), 0);
+    }
+
+    #[test]
+    fn a_broken_line_is_named_and_passed() {
+        let folder = tempfile::tempdir().unwrap();
+        let good = serde_json::to_string(&tile("a")).unwrap();
+        let singular = good.replace("[1.0,0.0,0.0,1.0,", "[0,0,0,0,");
+        let long = "x".repeat(3 * MAX_LINE);
+        let text = format!(
+            "{good}\n\nnonsense\r\n{singular}\n{{\"record\":\"song\"}}\n{long}\n{good}\r\n"
+        );
+        std::fs::write(folder.path().join(RecordReader::FILE), text).unwrap();
+        let lines = RecordReader::new(folder.path(), Cursor::default())
+            .read(99)
+            .unwrap();
+        let said: Vec<_> = lines
+            .iter()
+            .map(|l| l.record.as_ref().map_err(|b| b.line).err())
+            .collect();
+        assert_eq!(said, [None, Some(3), Some(4), Some(5), Some(6), None]);
+        let reason = |n: usize| lines[n].record.as_ref().unwrap_err().reason.clone();
+        assert!(reason(2).contains("inverted"), "{}", reason(2));
+        assert!(reason(4).contains("bytes"), "{}", reason(4));
+    }
+
+    #[test]
+    fn reading_in_pieces_equals_reading_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = RecordWriter::open(folder.path()).unwrap();
+        for n in 0..20 {
+            writer.append(&tile(&n.to_string())).unwrap();
+        }
+        let all = RecordReader::new(folder.path(), Cursor::default())
+            .read(99)
+            .unwrap();
+        let mut pieces = Vec::new();
+        let mut cursor = Cursor::default();
+        while let Some(line) = RecordReader::new(folder.path(), cursor)
+            .read(1)
+            .unwrap()
+            .pop()
+        {
+            cursor = line.next;
+            pieces.push(line);
+        }
+        assert_eq!(pieces, all);
+        assert_eq!(all.len(), 20);
+    }
+
+    #[test]
+    fn a_writer_that_died_spoils_only_its_line() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join(RecordReader::FILE), r#"{"record":"ti"#).unwrap();
+        RecordWriter::open(folder.path())
+            .unwrap()
+            .append(&tile("b"))
+            .unwrap();
+        let lines = RecordReader::new(folder.path(), Cursor::default())
+            .read(99)
+            .unwrap();
+        assert!(lines[0].record.is_err());
+        assert_eq!(lines[1].record, Ok(tile("b")));
+    }
+
+    #[test]
+    fn cut_records_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        RecordWriter::open(folder.path())
+            .unwrap()
+            .append(&tile("b"))
+            .unwrap();
+        let mut reader = RecordReader::new(
+            folder.path(),
+            Cursor {
+                offset: 9999,
+                line: 7,
+            },
+        );
+        assert!(matches!(
+            reader.read(1),
+            Err(AcquisitionError::RecordsCut { read: 9999, .. })
+        ));
+    }
+}

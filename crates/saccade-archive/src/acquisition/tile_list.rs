@@ -1,0 +1,202 @@
+//! Plain tile lists: `file x y z` per line, as TrakEM2 imports them.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use glam::DVec2;
+
+use super::AcquisitionError;
+
+/// A line of a tile list.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ListedTile {
+    /// The image as the list names it.
+    pub file: String,
+    /// Low corner in its section \[pixels\].
+    pub corner: DVec2,
+    /// Section: z index, possibly not starting at 0.
+    pub section: u32,
+}
+
+impl ListedTile {
+    /// The file's name without folder and extension: the tile's name.
+    pub fn name(&self) -> &str {
+        stem(&self.file)
+    }
+}
+
+/// File name without folder and extension; either slash separates folders.
+pub(super) fn stem(file: &str) -> &str {
+    let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
+    name.rsplit_once('.')
+        .map_or(name, |(stem, _)| if stem.is_empty() { name } else { stem })
+}
+
+/// Reads a tile list. Columns are separated by white space; file names may contain blanks. Empty
+/// lines and lines that begin with `#` are skipped.
+///
+/// # Errors
+///
+/// [`AcquisitionError::Read`]; [`AcquisitionError::Line`] for the first line without three numbers
+/// at its end, or with a section that is no whole number from 0.
+pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
+    let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
+        source,
+        path: path.to_owned(),
+    })?;
+    let text = String::from_utf8_lossy(&bytes);
+    let mut tiles = Vec::new();
+    for (line, text) in (1..).zip(text.lines()) {
+        let text = text.trim();
+        if text.is_empty() || text.starts_with('#') {
+            continue;
+        }
+        tiles.push(parse(text).map_err(|reason| AcquisitionError::Line {
+            line,
+            reason,
+            path: path.to_owned(),
+        })?);
+    }
+    Ok(tiles)
+}
+
+fn parse(text: &str) -> Result<ListedTile, String> {
+    let mut file = text;
+    let mut column = || {
+        let (rest, last) = file
+            .rsplit_once(char::is_whitespace)
+            .ok_or_else(|| format!("{text:?} is not `file x y z`"))?;
+        file = rest.trim_end();
+        Ok::<_, String>(last)
+    };
+    let (z, y, x) = (column()?, column()?, column()?);
+    let number = |what: &str, text: &str| match text.parse::<f64>() {
+        Ok(value) if value.is_finite() => Ok(value),
+        _ => Err(format!("{what} is {text:?}, which is no number")),
+    };
+    let corner = DVec2::new(number("x", x)?, number("y", y)?);
+    let z_value = number("z", z)?;
+    let valid = z_value >= 0.0 && z_value.fract() == 0.0 && z_value <= f64::from(u32::MAX);
+    if !valid {
+        return Err(format!(
+            "z is {z:?}, but a section is a whole number from 0"
+        ));
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "checked above")]
+    let section = z_value as u32;
+    Ok(ListedTile {
+        file: file.to_owned(),
+        corner,
+        section,
+    })
+}
+
+/// Finds images by file name anywhere below a folder: lists name folders of other machines.
+#[derive(Clone, Debug)]
+pub struct Images {
+    folder: PathBuf,
+    by_name: BTreeMap<String, PathBuf>,
+}
+
+impl Images {
+    /// Looks through a folder and the folders in it.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::Read`] for a folder that cannot be listed.
+    pub fn below(folder: &Path) -> Result<Self, AcquisitionError> {
+        let mut by_name = BTreeMap::new();
+        let mut open = vec![folder.to_owned()];
+        while let Some(at) = open.pop() {
+            let failed = |source| AcquisitionError::Read {
+                source,
+                path: at.clone(),
+            };
+            for entry in fs::read_dir(&at).map_err(failed)? {
+                let entry = entry.map_err(failed)?;
+                let kind = entry.file_type().map_err(failed)?;
+                if kind.is_dir() {
+                    open.push(entry.path());
+                } else if let Some(name) = entry.file_name().to_str() {
+                    // The smallest path, so that the answer does not depend on the disk's order.
+                    let path = entry.path();
+                    let known = by_name
+                        .entry(name.to_owned())
+                        .or_insert_with(|| path.clone());
+                    if path < *known {
+                        *known = path;
+                    }
+                }
+            }
+        }
+        Ok(Self {
+            folder: folder.to_owned(),
+            by_name,
+        })
+    }
+
+    /// The image that a list calls `file`: at that path below the folder, else by name alone.
+    pub fn find(&self, file: &str) -> Option<PathBuf> {
+        let as_named = super::image_path(&self.folder, file).filter(|p| p.is_file());
+        let name = file.rsplit(['/', '\\']).next()?;
+        as_named.or_else(|| self.by_name.get(name).cloned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blanks_comments_and_columns() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("list.txt");
+        fs::write(
+            &path,
+            "# made by hand\n\na/b c.tif\t1.5  -2 7\r\nd.tif 0 0 0.0\n",
+        )
+        .unwrap();
+        let tiles = read(&path).unwrap();
+        assert_eq!(tiles.len(), 2);
+        assert_eq!(
+            (tiles[0].file.as_str(), tiles[0].name()),
+            ("a/b c.tif", "b c")
+        );
+        assert_eq!(
+            (tiles[0].corner, tiles[0].section),
+            (DVec2::new(1.5, -2.0), 7)
+        );
+        for bad in [
+            "a.tif 1 2",
+            "a.tif 1 2 3.5",
+            "a.tif 1 x 3",
+            "a.tif 1 2 -1",
+            "a.tif inf 1 1",
+        ] {
+            fs::write(&path, format!("ok.tif 1 2 3\n{bad}\n")).unwrap();
+            let refused = matches!(read(&path), Err(AcquisitionError::Line { line: 2, .. }));
+            assert!(refused, "{bad}");
+        }
+    }
+
+    #[test]
+    fn images_are_found_by_name() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir_all(folder.path().join("deep/er")).unwrap();
+        fs::create_dir_all(folder.path().join("other")).unwrap();
+        for file in ["deep/er/a.tif", "other/a.tif", "b.tif"] {
+            fs::write(folder.path().join(file), "").unwrap();
+        }
+        let images = Images::below(folder.path()).unwrap();
+        let found = |file| {
+            images
+                .find(file)
+                .map(|p| p.strip_prefix(folder.path()).unwrap().to_owned())
+        };
+        assert_eq!(found("other/a.tif").unwrap(), Path::new("other/a.tif"));
+        assert_eq!(found("editme/a.tif").unwrap(), Path::new("deep/er/a.tif"));
+        assert_eq!(found("C:\\scope\\b.tif").unwrap(), Path::new("b.tif"));
+        assert_eq!(found("none.tif"), None);
+    }
+}
