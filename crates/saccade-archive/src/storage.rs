@@ -1,0 +1,76 @@
+//! Named objects that are written once, whole, and survive a crash.
+
+use std::fmt;
+use std::ops::Range;
+
+use bytes::Bytes;
+use futures::future::BoxFuture;
+
+pub mod conformance;
+mod error;
+mod faulty;
+mod local;
+mod memory;
+mod name;
+
+pub use error::StorageError;
+pub use faulty::{FaultyStorage, ReadFault, WriteFault};
+pub use local::LocalStorage;
+pub use memory::MemoryStorage;
+pub use name::check_name;
+
+/// Where a visualization archive keeps its objects: a folder, memory, an object store.
+///
+/// Names are relative paths such as `tiles/a.tif`, see [`check_name`]. An object is written whole
+/// or not at all: at any instant, and after a crash at any instant, a name holds what the last
+/// finished [`write_durable`](Self::write_durable) put there, or nothing. Implementations pass
+/// [`conformance`].
+///
+/// Dropping a future gives up waiting; a write that had begun may still take place, whole.
+pub trait Storage: Send + Sync + fmt::Debug {
+    /// The object's bytes, or those of `range` that exist: a range that reaches past the end is
+    /// cut there, one that begins past it is empty.
+    ///
+    /// # Errors
+    ///
+    /// [`StorageError::NotFound`] where there is no such object, others as they occur.
+    fn read<'a>(
+        &'a self,
+        name: &'a str,
+        range: Option<Range<u64>>,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>>;
+
+    /// Writes an object, in place of an older one of that name. When it returns, the object is
+    /// there even if the machine loses power in the next instant.
+    ///
+    /// # Errors
+    ///
+    /// [`StorageError::Full`], [`StorageError::Denied`], others as they occur. What was there
+    /// before is still there then.
+    fn write_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<(), StorageError>>;
+
+    /// Names of the objects that begin with `prefix`, sorted. Unfinished writes are not listed.
+    ///
+    /// # Errors
+    ///
+    /// As they occur.
+    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>>;
+
+    /// Removes an object. It is no error if there is none.
+    ///
+    /// # Errors
+    ///
+    /// As they occur.
+    fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>>;
+
+    /// An object's size \[bytes\].
+    ///
+    /// # Errors
+    ///
+    /// [`StorageError::NotFound`] where there is no such object, others as they occur.
+    fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>>;
+}

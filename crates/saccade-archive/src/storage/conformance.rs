@@ -1,0 +1,113 @@
+//! What every [`Storage`] must do. All implementations run it, also those of other crates.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+
+use super::{Storage, StorageError};
+
+/// Checks an empty storage, and leaves it empty. Runs on a tokio runtime.
+///
+/// # Panics
+///
+/// If the storage breaks its contract: this is a test.
+pub async fn check(storage: Arc<dyn Storage>) {
+    let storage = storage.as_ref();
+    assert_eq!(names(storage, "").await, [""; 0], "begin with an empty storage");
+    absent_objects_are_not_found(storage).await;
+    objects_come_back_whole_and_in_parts(storage).await;
+    later_writes_win(storage).await;
+    lists_are_sorted_and_cut_by_prefix(storage).await;
+    bad_names_are_refused(storage).await;
+    readers_see_whole_objects(storage).await;
+    for name in names(storage, "").await {
+        storage.delete(&name).await.expect("delete");
+    }
+    assert_eq!(names(storage, "").await, [""; 0], "all were deleted");
+}
+
+async fn names(storage: &dyn Storage, prefix: &str) -> Vec<String> {
+    storage.list(prefix).await.expect("list")
+}
+
+async fn write(storage: &dyn Storage, name: &str, bytes: &'static [u8]) {
+    storage.write_durable(name, Bytes::from_static(bytes)).await.expect("write");
+}
+
+async fn absent_objects_are_not_found(storage: &dyn Storage) {
+    let read = storage.read("tiles/none.tif", None).await;
+    assert!(matches!(read, Err(StorageError::NotFound { .. })), "{read:?}");
+    let size = storage.size("tiles/none.tif").await;
+    assert!(matches!(size, Err(StorageError::NotFound { .. })), "{size:?}");
+    storage.delete("tiles/none.tif").await.expect("deleting what is absent is no error");
+}
+
+async fn objects_come_back_whole_and_in_parts(storage: &dyn Storage) {
+    write(storage, "tiles/a/b.tif", b"0123456789").await;
+    write(storage, "empty", b"").await;
+    for (range, want) in [
+        (None, &b"0123456789"[..]),
+        (Some(0..10), b"0123456789"),
+        (Some(3..5), b"34"),
+        (Some(5..5), b""),
+        (Some(8..100), b"89"),
+        (Some(10..20), b""),
+        (Some(u64::MAX - 1..u64::MAX), b""),
+    ] {
+        let got = storage.read("tiles/a/b.tif", range.clone()).await.expect("read");
+        assert_eq!(got, want, "{range:?}");
+    }
+    assert_eq!(storage.size("tiles/a/b.tif").await.expect("size"), 10);
+    assert_eq!(storage.read("empty", None).await.expect("read"), b""[..]);
+    assert_eq!(storage.size("empty").await.expect("size"), 0);
+}
+
+async fn later_writes_win(storage: &dyn Storage) {
+    write(storage, "again", b"a long first version").await;
+    write(storage, "again", b"second").await;
+    assert_eq!(storage.read("again", None).await.expect("read"), b"second"[..]);
+    storage.delete("again").await.expect("delete");
+    let read = storage.read("again", None).await;
+    assert!(matches!(read, Err(StorageError::NotFound { .. })), "{read:?}");
+}
+
+async fn lists_are_sorted_and_cut_by_prefix(storage: &dyn Storage) {
+    for name in ["l/b", "l/a/z", "l/a", "lone", "l/c"].into_iter().filter(|n| *n != "l/a") {
+        write(storage, name, b"x").await;
+    }
+    assert_eq!(names(storage, "l").await, ["l/a/z", "l/b", "l/c", "lone"]);
+    assert_eq!(names(storage, "l/").await, ["l/a/z", "l/b", "l/c"]);
+    assert_eq!(names(storage, "l/a").await, ["l/a/z"]);
+    assert_eq!(names(storage, "l/a/z").await, ["l/a/z"]);
+    assert_eq!(names(storage, "nothing/like/it").await, [""; 0]);
+}
+
+async fn bad_names_are_refused(storage: &dyn Storage) {
+    for name in ["", "/absolute", "..", "a/../../b", "a//b", "a/", ".hidden", "a\\b", "a\0b"] {
+        let refused = |error: Option<StorageError>, what: &str| {
+            assert!(matches!(error, Some(StorageError::Name { .. })), "{what} {name:?}: {error:?}");
+        };
+        refused(storage.read(name, None).await.err(), "read");
+        refused(storage.write_durable(name, Bytes::new()).await.err(), "write");
+        refused(storage.delete(name).await.err(), "delete");
+        refused(storage.size(name).await.err(), "size");
+    }
+}
+
+/// Two versions are written in turn while they are read: no reader sees anything else.
+async fn readers_see_whole_objects(storage: &dyn Storage) {
+    let versions = [vec![1; 100_000], vec![2; 70_000]].map(Bytes::from);
+    storage.write_durable("busy", versions[0].clone()).await.expect("write");
+    let writer = async {
+        for turn in 0..8 {
+            storage.write_durable("busy", versions[turn % 2].clone()).await.expect("write");
+        }
+    };
+    let reader = async {
+        for _ in 0..16 {
+            let seen = storage.read("busy", None).await.expect("read");
+            assert!(versions.contains(&seen), "a mixture of {} bytes was read", seen.len());
+        }
+    };
+    futures::join!(writer, reader);
+}
