@@ -1,0 +1,87 @@
+//! What a frame was, read back later.
+
+use saccade_core::brick::BrickId;
+
+/// What a frame was. Arrives some frames later; not every frame has one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameReport {
+    /// Number that [`Renderer::render`](crate::Renderer::render) gave.
+    pub frame: u64,
+    /// Bricks the frame wanted and that are still not there, most wanted first.
+    ///
+    /// May be empty while the frame is incomplete: the next one will know more.
+    pub misses: Vec<BrickId>,
+    /// How true the picture is.
+    pub fidelity: Fidelity,
+    /// Level-of-detail bias in force: the view's plus what memory asked for.
+    pub lod_bias: f32,
+    /// Part of `lod_bias` that was added because the bricks of the view do not fit the memory.
+    pub memory_bias: f32,
+    /// What the rays did.
+    pub statistics: Statistics,
+    /// Memory in use.
+    pub memory: MemoryUse,
+}
+
+impl FrameReport {
+    /// Whether everything the frame wanted was there, up to date, at the level it wanted.
+    pub fn is_complete(&self) -> bool {
+        self.fidelity.missing == 0
+    }
+}
+
+/// How true a picture is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Fidelity {
+    /// Missing bricks, at least: unseen tables count as one, and a ray counts a few, front first.
+    pub missing: u32,
+    /// Of those, bricks drawn as they were before they changed.
+    pub stale: u32,
+    /// Levels between what was wanted and what was drawn instead, at most.
+    pub substituted_levels: u32,
+    /// Finest level wanted; `None` where no ray met the volume.
+    pub level: Option<u32>,
+}
+
+/// What the rays of a frame did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Statistics {
+    /// Samples taken. Wraps at 2³².
+    pub samples: u32,
+    /// Page table walks.
+    pub lookups: u32,
+    /// Of `samples`, those from another level than wanted.
+    pub substituted: u32,
+    /// Bricks and tables in use.
+    pub slots_used: u32,
+}
+
+/// Memory on the device \[bytes\]. All but the picture stays below the ceiling.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MemoryUse {
+    /// The brick cache.
+    pub bricks: u64,
+    /// The page directory, the page table cache and what marks their entries.
+    pub tables: u64,
+    /// Buffers for reading back.
+    pub readback: u64,
+    /// The picture.
+    pub image: u64,
+    /// The ceiling that was set.
+    pub ceiling: u64,
+    /// Places for bricks.
+    pub brick_slots: u32,
+    /// Of those, filled.
+    pub bricks_resident: u32,
+    /// Places for page table blocks.
+    pub table_slots: u32,
+    /// Of those, filled.
+    pub tables_resident: u32,
+}
+
+impl MemoryUse {
+    /// What counts against the ceiling.
+    pub fn total(&self) -> u64 {
+        self.bricks + self.tables + self.readback
+    }
+}
