@@ -1,0 +1,9 @@
+//! Tags, conditions, ranges and refusals.
+
+mod range;
+mod refusal;
+mod tag;
+
+pub(crate) use range::{Requested, requested};
+pub(crate) use refusal::{internal, not_found, try_again};
+pub(crate) use tag::{Tag, mark_encoding};

@@ -1,0 +1,195 @@
+//! Which address is answered by what.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use axum::extract::{ConnectInfo, Path, Request, State};
+use axum::http::header::{
+    ACCEPT_RANGES, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_RANGE, ETAG, HeaderMap,
+    RETRY_AFTER,
+};
+use axum::http::{Extensions, Method, StatusCode, Uri, Version};
+use axum::middleware::{Next, from_fn_with_state, map_response};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use serde_json::{Value, json};
+use tokio::sync::watch;
+use tower_http::CompressionLevel;
+use tower_http::compression::CompressionLayer;
+use tower_http::cors::{Any, CorsLayer};
+
+use crate::assets::asset;
+use crate::events;
+use crate::http::{internal, mark_encoding, not_found};
+use crate::server::{Compress, Compressible, Options};
+use crate::status::Status;
+use crate::volumes::{Published, Volumes};
+use crate::zarr::{Key, array, chunk, group};
+
+/// What every handler needs.
+#[derive(Clone)]
+pub(crate) struct App {
+    pub(crate) volumes: Volumes,
+    pub(crate) options: Options,
+    pub(crate) closing: watch::Receiver<bool>,
+}
+
+/// All addresses, with what they share: compression, tags, and access from pages of other origins.
+pub(crate) fn router(app: App) -> Router {
+    let shared = CorsLayer::new()
+        .allow_origin(Any)
+        .allow_methods([Method::GET, Method::HEAD])
+        .allow_headers(Any)
+        .expose_headers([
+            ACCEPT_RANGES,
+            CONTENT_ENCODING,
+            CONTENT_LENGTH,
+            CONTENT_RANGE,
+            ETAG,
+            RETRY_AFTER,
+        ])
+        .max_age(std::time::Duration::from_secs(86_400));
+    let marked = |_: StatusCode, _: Version, _: &HeaderMap, extensions: &Extensions| {
+        extensions.get::<Compressible>().is_some()
+    };
+    let gzip = CompressionLayer::new()
+        .quality(CompressionLevel::Fastest)
+        .compress_when(marked);
+    Router::new()
+        .route("/volumes.json", get(volumes))
+        .route("/v/{name}/volume.json", get(volume))
+        .route("/v/{name}/status.json", get(status))
+        .route("/v/{name}/events", get(changes))
+        .route("/v/{name}/zarr/{*key}", get(zarr))
+        .fallback(get(other))
+        .layer(from_fn_with_state(app.clone(), spare_near_clients))
+        .layer(gzip)
+        .layer(map_response(mark_encoding))
+        .layer(shared)
+        .with_state(app)
+}
+
+/// Compression costs a client on the same computer more than it saves.
+async fn spare_near_clients(
+    State(app): State<App>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let head = request.method() == Method::HEAD;
+    let mut response = next.run(request).await;
+    let far = match app.options.compress {
+        Compress::Always => true,
+        Compress::FarClients => !peer.ip().to_canonical().is_loopback(),
+    };
+    let extensions = response.extensions_mut();
+    let large = matches!(extensions.get(), Some(Compressible::Large));
+    if head || (large && !far) {
+        extensions.remove::<Compressible>();
+    }
+    response
+}
+
+fn described(value: impl serde::Serialize) -> Response {
+    let mut response = ([(CACHE_CONTROL, "no-cache")], Json(value)).into_response();
+    response.extensions_mut().insert(Compressible::Small);
+    response
+}
+
+async fn volumes(State(app): State<App>) -> Response {
+    let entry = |published: &Arc<Published>| {
+        let revision = published.history().revision();
+        json!({ "name": published.volume().name, "revision": revision })
+    };
+    let all: Vec<Value> = app.volumes.all().iter().map(entry).collect();
+    described(json!({ "volumes": all }))
+}
+
+async fn volume(State(app): State<App>, Path(name): Path<String>) -> Response {
+    let published = match find(&app, &name) {
+        Ok(published) => published,
+        Err(refusal) => return *refusal,
+    };
+    let revision = published.history().revision();
+    described(json!({ "volume": **published.volume(), "revision": revision }))
+}
+
+async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
+    let published = match find(&app, &name) {
+        Ok(published) => published,
+        Err(refusal) => return *refusal,
+    };
+    match &published.status {
+        None => {
+            let revision = published.history().revision();
+            described(Status {
+                revision,
+                ..Status::default()
+            })
+        }
+        Some(source) => match source.status().await {
+            Ok(status) => described(status),
+            Err(error) => internal(error.to_string()),
+        },
+    }
+}
+
+async fn changes(State(app): State<App>, Path(name): Path<String>, headers: HeaderMap) -> Response {
+    match find(&app, &name) {
+        Ok(published) => events::events(published, &headers, app.closing),
+        Err(refusal) => *refusal,
+    }
+}
+
+async fn zarr(
+    State(app): State<App>,
+    Path((name, key)): Path<(String, String)>,
+    headers: HeaderMap,
+) -> Response {
+    let published = match find(&app, &name) {
+        Ok(published) => published,
+        Err(refusal) => return *refusal,
+    };
+    let volume = published.volume();
+    match Key::parse(&key) {
+        Some(Key::Group) => described(group(volume)),
+        Some(Key::Array { level }) => match array(volume, level) {
+            Some(metadata) => described(metadata),
+            None => {
+                let levels = (0..volume.levels.len()).map(|level| format!("{level}/zarr.json"));
+                not_found(
+                    format!("volume {name:?} has no level {level}"),
+                    levels.collect(),
+                )
+            }
+        },
+        Some(Key::Chunk(id)) => chunk(&published, id, &headers, app.options.patience).await,
+        None => {
+            let keys = ["zarr.json", "LEVEL/zarr.json", "LEVEL/c/C/Z/Y/X"];
+            not_found(
+                format!("there is no {key:?} in an image"),
+                keys.map(Into::into).to_vec(),
+            )
+        }
+    }
+}
+
+/// The application's files, and everything that does not exist.
+async fn other(State(app): State<App>, uri: Uri, headers: HeaderMap) -> Response {
+    asset(uri.path(), &headers).unwrap_or_else(|| {
+        let mut known = vec!["/".to_owned(), "/volumes.json".to_owned()];
+        for name in app.volumes.names() {
+            let files = ["volume.json", "status.json", "events", "zarr/zarr.json"];
+            known.extend(files.map(|file| format!("/v/{name}/{file}")));
+        }
+        not_found(format!("there is nothing at {:?}", uri.path()), known)
+    })
+}
+
+fn find(app: &App, name: &str) -> Result<Arc<Published>, Box<Response>> {
+    app.volumes.get(name).ok_or_else(|| {
+        let error = format!("there is no volume {name:?}");
+        Box::new(not_found(error, app.volumes.names()))
+    })
+}
