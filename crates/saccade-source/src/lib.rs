@@ -20,6 +20,7 @@
 //!
 //! It knows nothing of bricks, borders, GPUs or views.
 
+mod changes;
 pub mod conformance;
 pub mod maybe_send;
 pub mod memory;

@@ -9,4 +9,4 @@ mod platform;
 #[path = "maybe_send/wasm.rs"]
 mod platform;
 
-pub use platform::{BoxFuture, BoxStream, MaybeSend, MaybeSync, spawn};
+pub use platform::{BoxFuture, BoxStream, MaybeSend, MaybeSync, sleep, spawn};

@@ -1,1 +1,346 @@
-//! To be filled.
+//! A volume behind a Saccade server, by HTTP. The same code natively and in browsers.
+
+mod chunks;
+mod event_parser;
+mod events;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::future::{AbortHandle, Abortable, Either, select};
+use reqwest::{Client, StatusCode, Url};
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+use crate::changes::Changes;
+use crate::conformance::check_volume;
+use crate::maybe_send::{BoxFuture, BoxStream, sleep, spawn};
+use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
+use chunks::Revisions;
+
+/// Largest chunk a server may announce \[bytes\].
+const LARGEST_CHUNK: u64 = 1 << 28;
+
+/// How patient a [`RemoteSource`] is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RemoteOptions {
+    /// A chunk of which nothing more came for so long has failed.
+    pub idle: Duration,
+    /// An event stream on which nothing came for so long, not even a comment, is opened anew.
+    pub events_idle: Duration,
+    /// Wait before the first attempt to open the event stream anew; it doubles with each failure.
+    pub reconnect: Duration,
+    /// Longest wait between attempts.
+    pub reconnect_at_most: Duration,
+}
+
+impl Default for RemoteOptions {
+    fn default() -> Self {
+        Self {
+            idle: Duration::from_secs(30),
+            events_idle: Duration::from_secs(60),
+            reconnect: Duration::from_millis(250),
+            reconnect_at_most: Duration::from_secs(10),
+        }
+    }
+}
+
+/// What went wrong between here and the server.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RemoteError {
+    /// No address.
+    #[error(
+        "{address:?} is no address of a Saccade server; give one such as http://localhost:8080"
+    )]
+    Address {
+        /// As given.
+        address: String,
+    },
+    /// The request failed or the connection broke.
+    #[error("no answer from {url}; is the server running?")]
+    Http {
+        /// What went wrong.
+        source: reqwest::Error,
+        /// What was asked for.
+        url: Url,
+    },
+    /// The server answered, but not with what was asked for.
+    #[error("the server answered {status} for {url}")]
+    Status {
+        /// Its answer.
+        status: StatusCode,
+        /// What was asked for.
+        url: Url,
+    },
+    /// Nothing more came.
+    #[error("nothing came for {} s from {url}", waited.as_secs_f32())]
+    Idle {
+        /// For so long.
+        waited: Duration,
+        /// What was asked for.
+        url: Url,
+    },
+    /// A chunk is not as long as the volume's chunks are.
+    #[error("{got} bytes or more came instead of {expected} from {url}")]
+    Length {
+        /// Bytes of a chunk.
+        expected: usize,
+        /// Bytes that came, as far as they were read.
+        got: usize,
+        /// What was asked for.
+        url: Url,
+    },
+    /// The answer is not what a Saccade server says.
+    #[error("cannot understand the answer from {url}; are server and client of the same version?")]
+    Answer {
+        /// What went wrong.
+        source: Box<dyn std::error::Error + Send + Sync>,
+        /// What was asked for.
+        url: Url,
+    },
+}
+
+impl RemoteError {
+    /// Whether asking again may help.
+    fn is_transient(&self) -> bool {
+        match self {
+            Self::Http { .. } | Self::Idle { .. } => true,
+            Self::Status { status, .. } => status.is_server_error(),
+            // Cut short by somebody on the way; too long is a misunderstanding.
+            Self::Length { expected, got, .. } => got < expected,
+            Self::Address { .. } | Self::Answer { .. } => false,
+        }
+    }
+}
+
+/// A volume that a Saccade server offers.
+///
+/// One connection for events is kept for as long as the source lives, and reopened when it breaks.
+pub struct RemoteSource {
+    volume: Arc<Volume>,
+    chunk_bytes: usize,
+    client: Client,
+    /// `.../v/NAME`, without a slash at the end.
+    url: Url,
+    options: RemoteOptions,
+    changes: Arc<Changes>,
+    revisions: Arc<Revisions>,
+    events: AbortHandle,
+}
+
+impl Drop for RemoteSource {
+    fn drop(&mut self) {
+        self.events.abort();
+    }
+}
+
+#[derive(Deserialize)]
+struct VolumeJson {
+    volume: Volume,
+    revision: u64,
+}
+
+#[derive(Deserialize)]
+struct VolumesJson {
+    volumes: Vec<NamedVolume>,
+}
+
+#[derive(Deserialize)]
+struct NamedVolume {
+    name: String,
+}
+
+/// Names of the volumes a server offers, at its `base` address.
+///
+/// # Errors
+///
+/// [`SourceError::Open`] if there is no server or it does not answer as one.
+pub async fn volumes(base: &str) -> Result<Vec<String>, SourceError> {
+    let list = async {
+        let url = address(base, &["volumes.json"])?;
+        let list: VolumesJson = get_json(&Client::new(), url, RemoteOptions::default()).await?;
+        Ok(list.volumes.into_iter().map(|v| v.name).collect())
+    };
+    list.await.map_err(|error| open_error(error, base))
+}
+
+impl RemoteSource {
+    /// Opens the volume `name` of the server at `base`, such as `http://localhost:8080`.
+    ///
+    /// # Errors
+    ///
+    /// [`SourceError::NoVolume`] if the server has none of that name, [`SourceError::Open`] if
+    /// there is no server, or its description makes no sense.
+    pub async fn open(base: &str, name: &str) -> Result<Self, SourceError> {
+        Self::open_with(base, name, RemoteOptions::default()).await
+    }
+
+    /// Like [`Self::open`], with other patience.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::open`].
+    pub async fn open_with(
+        base: &str,
+        name: &str,
+        options: RemoteOptions,
+    ) -> Result<Self, SourceError> {
+        let client = Client::new();
+        let described = Self::describe(&client, base, name, options).await;
+        let (url, VolumeJson { volume, revision }) = match described {
+            Ok(described) => described,
+            Err(RemoteError::Status { status, .. }) if status == StatusCode::NOT_FOUND => {
+                let known = volumes(base).await?;
+                let name = name.to_owned();
+                return Err(SourceError::NoVolume { name, known });
+            }
+            Err(error) => return Err(open_error(error, base)),
+        };
+        let changes = Changes::new(VoxelBox::of_size(volume.extent()), revision);
+        let revisions = Arc::new(Revisions::new(revision));
+        let (events, registration) = AbortHandle::new_pair();
+        let follow = events::Follower {
+            client: client.clone(),
+            url: url.clone(),
+            options,
+            changes: changes.clone(),
+            revisions: revisions.clone(),
+            whole: VoxelBox::of_size(volume.extent()),
+        };
+        spawn(async move {
+            // The error only says that the source was dropped.
+            let _ = Abortable::new(follow.run(revision), registration).await;
+        });
+        let chunk_bytes = volume.chunk.as_usizevec3().element_product() * volume.dtype.bytes();
+        Ok(Self {
+            volume: Arc::new(volume),
+            chunk_bytes,
+            client,
+            url,
+            options,
+            changes,
+            revisions,
+            events,
+        })
+    }
+
+    async fn describe(
+        client: &Client,
+        base: &str,
+        name: &str,
+        options: RemoteOptions,
+    ) -> Result<(Url, VolumeJson), RemoteError> {
+        let url = address(base, &["v", name])?;
+        let json = joined(&url, &["volume.json"]);
+        let described: VolumeJson = get_json(client, json.clone(), options).await?;
+        let volume = &described.volume;
+        let axes = volume.chunk.to_array().map(u64::from);
+        let bytes = volume.dtype.bytes() as u64;
+        let bytes = axes.iter().try_fold(bytes, |n, edge| n.checked_mul(*edge));
+        let wrong = match check_volume(volume) {
+            Err(violation) => Some(violation.into()),
+            Ok(()) if bytes.is_none_or(|bytes| bytes > LARGEST_CHUNK) => {
+                Some(format!("chunks of {} voxels are too large", volume.chunk).into())
+            }
+            Ok(()) => None,
+        };
+        if let Some(source) = wrong {
+            return Err(RemoteError::Answer { source, url: json });
+        }
+        Ok((url, described))
+    }
+}
+
+impl VolumeSource for RemoteSource {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.volume
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        Box::pin(self.fetch(id))
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.changes.stream()
+    }
+}
+
+fn open_error(error: RemoteError, location: &str) -> SourceError {
+    SourceError::Open {
+        source: Arc::new(error),
+        location: location.to_owned(),
+    }
+}
+
+/// The address of `parts` below a server's `base`.
+fn address(base: &str, parts: &[&str]) -> Result<Url, RemoteError> {
+    let error = || RemoteError::Address {
+        address: base.to_owned(),
+    };
+    let mut url = Url::parse(base).map_err(|_| error())?;
+    if url.cannot_be_a_base() || !url.has_host() {
+        return Err(error());
+    }
+    url.set_query(None);
+    url.set_fragment(None);
+    Ok(joined(&url, parts))
+}
+
+/// The address of `parts` below `url`; each part is escaped.
+fn joined(url: &Url, parts: &[&str]) -> Url {
+    let mut url = url.clone();
+    if let Ok(mut path) = url.path_segments_mut() {
+        path.pop_if_empty().extend(parts);
+    }
+    url
+}
+
+async fn get_json<T: DeserializeOwned>(
+    client: &Client,
+    url: Url,
+    options: RemoteOptions,
+) -> Result<T, RemoteError> {
+    let http = |source: reqwest::Error, url| {
+        let source = source.without_url();
+        RemoteError::Http { source, url }
+    };
+    let get = async {
+        let answer = client.get(url.clone()).send().await;
+        let answer = answer.map_err(|e| http(e, url.clone()))?;
+        if !answer.status().is_success() {
+            let status = answer.status();
+            return Err(RemoteError::Status {
+                status,
+                url: url.clone(),
+            });
+        }
+        answer.bytes().await.map_err(|e| http(e, url.clone()))
+    };
+    let bytes = within(options.idle, &url, get).await??;
+    serde_json::from_slice(&bytes).map_err(|source| {
+        let source = source.into();
+        RemoteError::Answer { source, url }
+    })
+}
+
+/// What `future` returns, unless it takes longer than `limit`; then it is dropped.
+async fn within<T>(
+    limit: Duration,
+    url: &Url,
+    future: impl Future<Output = T>,
+) -> Result<T, RemoteError> {
+    let (future, timer) = (std::pin::pin!(future), std::pin::pin!(sleep(limit)));
+    match select(future, timer).await {
+        Either::Left((done, _)) => Ok(done),
+        Either::Right(_) => Err(RemoteError::Idle {
+            waited: limit,
+            url: url.clone(),
+        }),
+    }
+}
+
+#[cfg(all(test, not(target_family = "wasm")))]
+mod tests;

@@ -28,13 +28,20 @@ impl ChunkId {
         let exists = (self.channel as usize) < volume.channels.len()
             && self.chunk.cmplt(volume.chunks(self.level as usize)).all();
         let min = exists.then(|| self.chunk * volume.chunk)?;
-        Some(VoxelBox::new(min, min.saturating_add(volume.chunk).min(level.extent)))
+        Some(VoxelBox::new(
+            min,
+            min.saturating_add(volume.chunk).min(level.extent),
+        ))
     }
 }
 
 impl fmt::Display for ChunkId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "channel {} level {} chunk {}", self.channel, self.level, self.chunk)
+        write!(
+            f,
+            "channel {} level {} chunk {}",
+            self.channel, self.level, self.chunk
+        )
     }
 }
 

@@ -18,3 +18,8 @@ pub type BoxStream<'a, T> = futures::stream::BoxStream<'a, T>;
 pub fn spawn(future: impl Future<Output = ()> + Send + 'static) {
     drop(tokio::spawn(future));
 }
+
+/// Returns after `duration`. Needs the timer of the Tokio runtime it is awaited in.
+pub async fn sleep(duration: std::time::Duration) {
+    tokio::time::sleep(duration).await;
+}

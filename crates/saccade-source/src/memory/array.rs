@@ -1,0 +1,161 @@
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+
+use glam::UVec3;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+
+use super::average::{level0_voxels, mean};
+use super::{build_chunk, only_bytes};
+use crate::changes::Changes;
+use crate::maybe_send::{BoxFuture, BoxStream};
+use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
+
+/// A small 8-bit volume held whole, all its levels too. Voxels can be set while it is watched.
+///
+/// Coarser levels are means of the level-0 voxels that are not 0.
+pub struct ArraySource {
+    volume: Arc<Volume>,
+    /// Per level `[c, z, y, x]`.
+    levels: RwLock<Vec<Vec<u8>>>,
+    changes: Arc<Changes>,
+}
+
+/// An array whose size is not that of the volume.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{got} values given for {expected} voxels")]
+pub struct WrongLength {
+    /// Values the place needs.
+    pub expected: u64,
+    /// Values given.
+    pub got: usize,
+}
+
+impl WrongLength {
+    fn check(expected: u64, got: usize) -> Result<(), Self> {
+        if expected == got as u64 {
+            Ok(())
+        } else {
+            Err(Self { expected, got })
+        }
+    }
+}
+
+impl ArraySource {
+    /// From the level-0 voxels of all channels `[c, z, y, x]`.
+    ///
+    /// # Errors
+    ///
+    /// [`WrongLength`] where there are not as many values as voxels.
+    ///
+    /// # Panics
+    ///
+    /// On a volume that is not 8 bit.
+    pub fn new(volume: Volume, level0: Vec<u8>) -> Result<Self, WrongLength> {
+        let volume = only_bytes(volume);
+        let whole = VoxelBox::of_size(volume.extent());
+        let channels = volume.channels.len();
+        WrongLength::check(whole.voxels() * channels as u64, level0.len())?;
+        let coarser = volume.levels[1..].iter().map(|level| {
+            let size = level.extent.as_usizevec3();
+            vec![0; size.x * size.y * size.z * channels]
+        });
+        let levels = std::iter::once(level0).chain(coarser).collect();
+        let source = Self {
+            changes: Changes::new(whole, 0),
+            levels: RwLock::new(levels),
+            volume,
+        };
+        source.average(whole);
+        Ok(source)
+    }
+
+    /// Sets level-0 voxels of channel 0, x fastest, brings the levels up to date and tells
+    /// listeners. Returns the revision.
+    ///
+    /// # Errors
+    ///
+    /// [`WrongLength`] where `values` does not fill the box, or the box leaves the volume.
+    pub fn set(&self, voxels: VoxelBox, values: &[u8]) -> Result<u64, WrongLength> {
+        let inside = voxels.intersection(VoxelBox::of_size(self.volume.extent()));
+        WrongLength::check(inside.voxels(), values.len())?;
+        if !voxels.is_empty() && inside != voxels {
+            return Err(WrongLength {
+                expected: inside.voxels(),
+                got: values.len(),
+            });
+        }
+        {
+            let mut levels = self.levels.write().unwrap_or_else(PoisonError::into_inner);
+            for (voxel, value) in voxels.iter().zip(values) {
+                let at = index(self.volume.extent(), 0, voxel);
+                levels[0][at] = *value;
+            }
+        }
+        self.average(voxels);
+        Ok(self.changes.send_next(voxels, ChangeReason::Tile))
+    }
+
+    fn average(&self, level0: VoxelBox) {
+        let extent = self.volume.extent();
+        let mut levels = self.levels.write().unwrap_or_else(PoisonError::into_inner);
+        let (finest, coarser) = levels.split_first_mut().expect("a volume has a level");
+        for (level, values) in self.volume.levels[1..].iter().zip(coarser) {
+            for channel in 0..self.volume.channels.len() {
+                for voxel in level.box_from_voxels(level0).iter() {
+                    let covered = level0_voxels(voxel, level.downsampling, extent);
+                    values[index(level.extent, channel, voxel)] =
+                        mean(covered.iter().map(|v| finest[index(extent, channel, v)]));
+                }
+            }
+        }
+    }
+
+    fn levels(&self) -> RwLockReadGuard<'_, Vec<Vec<u8>>> {
+        self.levels.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
+        let levels = self.levels();
+        build_chunk(&self.volume, id, |start, row| {
+            let extent = self.volume.levels[id.level as usize].extent;
+            let at = index(extent, id.channel as usize, start);
+            row.copy_from_slice(&levels[id.level as usize][at..at + row.len()]);
+        })
+    }
+}
+
+/// Where a voxel is in an array `[c, z, y, x]`.
+fn index(extent: UVec3, channel: usize, voxel: UVec3) -> usize {
+    let (extent, voxel) = (extent.as_usizevec3(), voxel.as_usizevec3());
+    ((channel * extent.z + voxel.z) * extent.y + voxel.y) * extent.x + voxel.x
+}
+
+impl VolumeSource for ArraySource {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.volume
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        Box::pin(async move { self.chunk(id) })
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.changes.stream()
+    }
+
+    fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
+        let voxels = id.voxels(&self.volume)?;
+        let extent = self.volume.levels[id.level as usize].extent;
+        let levels = self.levels();
+        let values = &levels[id.level as usize];
+        let measured = || {
+            let all = voxels.iter();
+            let all = all.map(|v| u16::from(values[index(extent, id.channel as usize, v)]));
+            all.filter(|v| *v != 0)
+        };
+        Some(ValueRange {
+            min: measured().min()?,
+            max: measured().max()?,
+        })
+    }
+}
