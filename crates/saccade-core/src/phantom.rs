@@ -16,7 +16,7 @@
 //! Labels are never 0. A cell's voxels hang together and membranes are painted where labels change,
 //! both as far as the voxel size can show it.
 
-use glam::{DVec3, UVec3};
+use glam::DVec3;
 
 use crate::space::{Physical, Point};
 use crate::voxel_box::VoxelBox;
@@ -31,7 +31,6 @@ mod territory;
 pub use sampler::Sampler;
 
 use random::mix;
-use territory::Tissue;
 
 /// Tissue without end in every positive direction.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -132,17 +131,12 @@ impl Phantom {
         found.sort_by(|a, b| {
             let key = |s: &Synapse| [s.position.xyz.z, s.position.xyz.y, s.position.xyz.x];
             let pairs = key(a).into_iter().zip(key(b));
-            pairs.map(|(a, b)| a.total_cmp(&b)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
+            pairs
+                .map(|(a, b)| a.total_cmp(&b))
+                .find(|o| o.is_ne())
+                .unwrap_or(std::cmp::Ordering::Equal)
         });
         found
-    }
-
-    /// What kind of tissue a voxel belongs to.
-    pub fn is_neurite(&self, voxel: UVec3) -> bool {
-        let (y_nm, z_nm) = self.row_nm(voxel.y, voxel.z);
-        let straight =
-            noise::RowWarp::new(self.warp_seed(), y_nm, z_nm).at(self.x_nm(voxel.x));
-        self.sampler().territory_at(straight).territory.tissue == Tissue::Bundle
     }
 
     fn x_nm(&self, x: u32) -> f64 {
@@ -150,7 +144,10 @@ impl Phantom {
     }
 
     fn row_nm(&self, y: u32, z: u32) -> (f64, f64) {
-        ((f64::from(y) + 0.5) * self.voxel_nm.y, (f64::from(z) + 0.5) * self.voxel_nm.z)
+        (
+            (f64::from(y) + 0.5) * self.voxel_nm.y,
+            (f64::from(z) + 0.5) * self.voxel_nm.z,
+        )
     }
 
     /// Half width of a membrane: as in tissue, but wide enough to show.

@@ -15,8 +15,6 @@ const BLOCK: f64 = 0.5;
 const JITTER: f64 = 0.38;
 /// Largest squared radius of a site.
 const WEIGHT: f64 = 0.14;
-/// Sites within two lattice cells of a block, at most.
-const MOST_SITES: usize = 6 * 6 * 6;
 /// A bundle never owns a point further from its centre than this \[nm\].
 const OWNED_NM: f64 = 4_500.0;
 /// Share of sites that have a synapse with a neighbour, where the two really touch.
@@ -111,7 +109,7 @@ impl Bundle {
             per_nm,
             across_nm,
             along_nm,
-            reach_nm: BORDER_REACH_NM.min(0.2 * across_nm),
+            reach_nm: BORDER_REACH_NM.min(0.15 * across_nm),
         }
     }
 
@@ -137,7 +135,11 @@ impl Bundle {
         let id = hash(self.id, cell);
         let jitter = DVec3::new(signed(id, 0), signed(id, 1), signed(id, 2));
         let at = cell.as_dvec3() + 0.5 + jitter * JITTER;
-        Site { id, at, weight: WEIGHT * unit(id, 3) }
+        Site {
+            id,
+            at,
+            weight: WEIGHT * unit(id, 3),
+        }
     }
 
     /// Steepness of the border between two sites: how fast the difference of their distances grows
@@ -178,10 +180,20 @@ impl Bundle {
                 }
             }
         }
-        let (pre, post) = if bits & (1 << 21) != 0 { (one, other) } else { (other, one) };
+        let (pre, post) = if bits & (1 << 21) != 0 {
+            (one, other)
+        } else {
+            (other, one)
+        };
         let across = (post.at - pre.at) * (2.0 / self.steepness(&pre, &post));
         let radius_nm = (80.0 + 110.0 * unit(bits, 2)).min(0.45 * self.across_nm);
-        Some(Junction { pre: pre.id, post: post.id, at, across, radius_nm })
+        Some(Junction {
+            pre: pre.id,
+            post: post.id,
+            at,
+            across,
+            radius_nm,
+        })
     }
 
     /// Whether a synapse lies well inside the bundle; `territory_at` answers for any point.
@@ -248,25 +260,36 @@ impl Bundle {
                 }
             }
         }
-        let nearest = |s: &Site| (s.at.clamp(min, max) - s.at).length_squared() - s.weight;
+        // Differences of two distances are linear, so their least value in the block is exact. A
+        // site matters if nowhere is it so far behind one of the likely owners that even its border
+        // is out of reach.
+        let (middle, half) = (min + 0.5 * BLOCK, 0.5 * BLOCK);
+        sites.sort_unstable_by(|a, b| a.distance(middle).total_cmp(&b.distance(middle)));
         let furthest = |s: &Site| (s.at - min).abs().max((s.at - max).abs()).length_squared();
-        let bound = sites.iter().map(|s| furthest(s) - s.weight).fold(f64::INFINITY, f64::min);
-        let owner_reach = (bound.max(0.0) + WEIGHT).sqrt();
-        let per_unit = 2.0 * self.reach_nm * self.per_nm.max_element();
-        sites.retain(|s| nearest(s) <= bound + per_unit * (furthest(s).sqrt() + owner_reach));
+        let owner_reach = (furthest(&sites[0]) - sites[0].weight + WEIGHT)
+            .max(0.0)
+            .sqrt();
+        let likely: [Site; 6] = std::array::from_fn(|n| sites[n]);
+        sites.retain(|site| {
+            let apart = (site.at - middle).abs() + half + owner_reach;
+            let reach = 2.0 * self.reach_nm * (apart * self.per_nm).length();
+            likely.iter().all(|owner| {
+                let slope = 2.0 * (owner.at - site.at).abs().element_sum();
+                site.distance(middle) - owner.distance(middle) - slope * half < reach
+            })
+        });
         Block { sites, junctions }
     }
 
-    /// The neurite at a point of `block`.
-    pub(super) fn at(&self, block: &Block, at: DVec3) -> Neurite {
+    /// The neurite at a point of `block`. `distances` is room to work in.
+    pub(super) fn at(&self, block: &Block, at: DVec3, distances: &mut Vec<f64>) -> Neurite {
         let mut owner = 0;
         let mut least = f64::INFINITY;
-        let mut distances = [f64::INFINITY; MOST_SITES];
-        for ((n, site), slot) in block.sites.iter().enumerate().zip(&mut distances) {
-            let distance = site.distance(at);
-            *slot = distance;
-            if distance < least {
-                (owner, least) = (n, distance);
+        distances.clear();
+        distances.extend(block.sites.iter().map(|site| site.distance(at)));
+        for (n, distance) in distances.iter().enumerate() {
+            if *distance < least {
+                (owner, least) = (n, *distance);
             }
         }
         let owner_at = owner;
@@ -274,12 +297,19 @@ impl Bundle {
         let mut border_nm = f64::INFINITY;
         // What is further ahead than this is out of reach, as sites are less than 4 apart.
         let worth = least + 8.0 * self.reach_nm * self.per_nm.max_element();
-        for ((n, site), distance) in block.sites.iter().enumerate().zip(&distances) {
+        for ((n, site), distance) in block.sites.iter().enumerate().zip(&*distances) {
             if *distance < worth && n != owner_at {
                 border_nm = border_nm.min((distance - least) / self.steepness(owner, site));
             }
         }
-        let border_nm = if border_nm < self.reach_nm { border_nm } else { f64::INFINITY };
-        Neurite { site: *owner, border_nm }
+        let border_nm = if border_nm < self.reach_nm {
+            border_nm
+        } else {
+            f64::INFINITY
+        };
+        Neurite {
+            site: *owner,
+            border_nm,
+        }
     }
 }

@@ -33,7 +33,15 @@ impl<const N: usize> RowNoise<N> {
     pub(super) fn new(seed: u64, period_nm: f64, y_nm: f64, z_nm: f64) -> Self {
         let per_nm = 1.0 / period_nm;
         let (y, z) = (cell_and_ease(y_nm * per_nm), cell_and_ease(z_nm * per_nm));
-        let mut row = Self { seed, per_nm, y, z, at: 0, left: [0.0; N], right: [0.0; N] };
+        let mut row = Self {
+            seed,
+            per_nm,
+            y,
+            z,
+            at: 0,
+            left: [0.0; N],
+            right: [0.0; N],
+        };
         row.left = row.plane(0);
         row.right = row.plane(1);
         row
@@ -58,7 +66,11 @@ impl<const N: usize> RowNoise<N> {
         let position = x_nm * self.per_nm;
         let cell = floor(position);
         if cell != self.at {
-            self.left = if cell == self.at + 1 { self.right } else { self.plane(cell) };
+            self.left = if cell == self.at + 1 {
+                self.right
+            } else {
+                self.plane(cell)
+            };
             self.right = self.plane(cell + 1);
             self.at = cell;
         }
@@ -88,9 +100,16 @@ impl RowWarp {
         let mut n = 0;
         let octaves = OCTAVES.map(|(period, amplitude)| {
             n += 1;
-            (RowNoise::new(super::random::mix(seed ^ n), period, y_nm, z_nm), amplitude)
+            (
+                RowNoise::new(super::random::mix(seed ^ n), period, y_nm, z_nm),
+                amplitude,
+            )
         });
-        Self { y_nm, z_nm, octaves }
+        Self {
+            y_nm,
+            z_nm,
+            octaves,
+        }
     }
 
     /// Where in the straight geometry the tissue at `x_nm` of the row comes from \[nm\].

@@ -12,7 +12,7 @@ use super::random::{floor3, hash, mix, signed, unit};
 use super::sampler::{InBundle, Spot};
 use super::territory::{BORDER_REACH_NM, Territory, Tissue};
 
-const CYTOPLASM: f64 = 176.0;
+const CYTOPLASM: f64 = 187.0;
 const MEMBRANE: f64 = 66.0;
 const CLEFT: f64 = 34.0;
 const MITOCHONDRION: f64 = 118.0;
@@ -92,7 +92,12 @@ impl RowPaint {
     }
 
     fn neurite(&self, spot: &InBundle<'_>, whole: &Spot<'_>, grain: f64) -> f64 {
-        let InBundle { bundle, neurite, at, .. } = spot;
+        let InBundle {
+            bundle,
+            neurite,
+            at,
+            ..
+        } = spot;
         let bits = mix(neurite.site.id ^ 0xce11);
         let tone = 15.0 * signed(bits, 0) + if unit(bits, 1) < 0.12 { -22.0 } else { 0.0 };
         let mut value = CYTOPLASM + tone + 7.0 * grain;
@@ -120,11 +125,17 @@ impl RowPaint {
     fn mitochondrion(&self, around: f64, outside_nm: f64, cristae: f64) -> f64 {
         let inner = MITOCHONDRION + 13.0 * cristae;
         let value = mixed(around, inner, step(-outside_nm, 6.0));
-        mixed(value, MEMBRANE + 14.0, bump(outside_nm, 1.8 * self.membrane_nm))
+        mixed(
+            value,
+            MEMBRANE + 14.0,
+            bump(outside_nm, 1.8 * self.membrane_nm),
+        )
     }
 
     fn soma(&self, spot: &Spot<'_>, cloud: f64, grain: f64) -> f64 {
-        let Territory { centre, radius, id, .. } = spot.here.territory;
+        let Territory {
+            centre, radius, id, ..
+        } = spot.here.territory;
         let from_centre = spot.straight - centre;
         let lumpy = 1.0 + 0.05 * cloud;
         let outside_nucleus = from_centre.length() - 0.68 * radius * lumpy;
@@ -136,7 +147,11 @@ impl RowPaint {
             let value = mixed(value, 92.0 + 10.0 * grain, step(-nucleolus, 40.0));
             // Chromatin lines the envelope.
             let value = mixed(value, 128.0, 0.7 * bump(outside_nucleus, 130.0));
-            return mixed(value, MEMBRANE, bump(outside_nucleus, 2.0 * self.membrane_nm));
+            return mixed(
+                value,
+                MEMBRANE,
+                bump(outside_nucleus, 2.0 * self.membrane_nm),
+            );
         }
         let mut value = 160.0 + 8.0 * grain;
         // Endoplasmic reticulum: sheets where the noise crosses zero.
@@ -152,17 +167,23 @@ impl RowPaint {
             let across = (off - axis * along).length();
             let beyond = (along.abs() - 80.0).max(0.0);
             let outside = (across * across + beyond * beyond).sqrt() - 125.0;
-            let outside = outside.max(40.0 - spot.border_nm).max(40.0 - outside_nucleus);
+            let outside = outside
+                .max(40.0 - spot.border_nm)
+                .max(40.0 - outside_nucleus);
             value = self.mitochondrion(value, outside, (along * 0.12).sin() + grain);
         }
-        mixed(value, MEMBRANE, bump(outside_nucleus, 2.0 * self.membrane_nm))
+        mixed(
+            value,
+            MEMBRANE,
+            bump(outside_nucleus, 2.0 * self.membrane_nm),
+        )
     }
 
     fn vessel(&self, spot: &Spot<'_>, grain: f64) -> f64 {
         let Territory { centre, radius, .. } = spot.here.territory;
         // The wall, an endothelial cell, is what the lumen leaves; then a dark basal lamina.
         let inside = 1.3 * radius - (spot.straight - centre).length();
-        let inside = inside.min(spot.border_nm.min(BORDER_REACH_NM) - 85.0);
+        let inside = inside.min(spot.border_nm - 60.0);
         let wall = 134.0 + 14.0 * grain;
         let wall = mixed(wall, 96.0, bump(spot.border_nm, 60.0));
         let value = mixed(wall, LUMEN, step(inside, 6.0));
@@ -171,7 +192,12 @@ impl RowPaint {
 
     /// Clefts with their density and vesicles, over what is already there.
     fn synapses(&self, spot: &InBundle<'_>, value: f64) -> f64 {
-        let InBundle { bundle, block, at, neurite } = spot;
+        let InBundle {
+            bundle,
+            block,
+            at,
+            neurite,
+        } = spot;
         let mut value = value;
         for junction in &block.junctions {
             let id = neurite.site.id;
@@ -188,14 +214,26 @@ impl RowPaint {
             let aside = (distance * distance - across * across).max(0.0).sqrt();
             let zone = step(junction.radius_nm - aside, 12.0);
             // The density on the postsynaptic side is what makes a synapse stand out.
-            let (reach, dark) = if presynaptic { (16.0, 52.0) } else { (40.0, CLEFT) };
+            let (reach, dark) = if presynaptic {
+                (16.0, 52.0)
+            } else {
+                (40.0, CLEFT)
+            };
             let reach = reach + self.membrane_nm;
             value = mixed(value, dark.min(value), zone * bump(across, reach));
-            value = mixed(value, CLEFT.min(value), zone * bump(across, 2.0 * self.membrane_nm));
+            value = mixed(
+                value,
+                CLEFT.min(value),
+                zone * bump(across, 2.0 * self.membrane_nm),
+            );
             if presynaptic && across < -34.0 {
                 let shell = self.vesicle(bundle.straight(*at));
                 let cloud = step(SYNAPSE_REACH_NM - 90.0 - distance, 40.0);
-                value = mixed(value, 92.0, shell * cloud * step(spot.neurite.border_nm - 26.0, 4.0));
+                value = mixed(
+                    value,
+                    92.0,
+                    shell * cloud * step(spot.neurite.border_nm - 26.0, 4.0),
+                );
             }
         }
         value

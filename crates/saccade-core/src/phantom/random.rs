@@ -31,7 +31,10 @@ pub(super) fn signed(bits: u64, n: u32) -> f64 {
 
 /// Rounds down. `f64::floor` is a library call on baseline x86-64, and this runs per voxel.
 pub(super) fn floor(value: f64) -> i32 {
-    #[expect(clippy::cast_possible_truncation, reason = "positions over lattice spacing; `as` saturates")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "positions over lattice spacing; `as` saturates"
+    )]
     let toward_zero = value as i32;
     toward_zero - i32::from(value < f64::from(toward_zero))
 }

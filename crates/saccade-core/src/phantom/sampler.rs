@@ -49,7 +49,12 @@ pub(super) struct InBundle<'a> {
 impl Sampler {
     pub(super) fn new(phantom: Phantom) -> Self {
         let (blocks, bundles) = (HashMap::new(), HashMap::new());
-        Self { phantom, blocks, bundles, bundle_blocks: HashMap::new() }
+        Self {
+            phantom,
+            blocks,
+            bundles,
+            bundle_blocks: HashMap::new(),
+        }
     }
 
     /// Writes the values of the voxels from (`x0`, `y`, `z`) along x.
@@ -89,6 +94,7 @@ impl Sampler {
         let mut block: Option<(IVec3, Arc<territory::Block>)> = None;
         let mut bundle: Option<Arc<Bundle>> = None;
         let mut bundle_block: Option<(u64, IVec3, Arc<bundle::Block>)> = None;
+        let mut distances = Vec::new();
         for (x, _) in (x0..).zip(0..len) {
             let x_nm = self.phantom.x_nm(x);
             let straight = warp.at(x_nm);
@@ -100,7 +106,17 @@ impl Sampler {
             let here = block.at(straight);
             if here.territory.tissue != Tissue::Bundle {
                 let (label, border_nm) = (here.territory.id, here.border_nm);
-                each(x, x_nm, &Spot { straight, here, neurite: None, label, border_nm });
+                each(
+                    x,
+                    x_nm,
+                    &Spot {
+                        straight,
+                        here,
+                        neurite: None,
+                        label,
+                        border_nm,
+                    },
+                );
                 continue;
             }
             let bundle = match &mut bundle {
@@ -111,13 +127,32 @@ impl Sampler {
             let id = bundle::block_of(at);
             let block = match &mut bundle_block {
                 Some((owner, known, block)) if (*owner, *known) == (bundle.id, id) => block,
-                stale => &mut stale.insert((bundle.id, id, self.bundle_block(bundle, id))).2,
+                stale => {
+                    &mut stale
+                        .insert((bundle.id, id, self.bundle_block(bundle, id)))
+                        .2
+                }
             };
-            let neurite = bundle.at(block, at);
+            let neurite = bundle.at(block, at, &mut distances);
             let label = bundle.label(neurite.site.id);
             let border_nm = here.border_nm.min(neurite.border_nm);
-            let neurite = Some(InBundle { bundle, block, at, neurite });
-            each(x, x_nm, &Spot { straight, here, neurite, label, border_nm });
+            let neurite = Some(InBundle {
+                bundle,
+                block,
+                at,
+                neurite,
+            });
+            each(
+                x,
+                x_nm,
+                &Spot {
+                    straight,
+                    here,
+                    neurite,
+                    label,
+                    border_nm,
+                },
+            );
         }
     }
 

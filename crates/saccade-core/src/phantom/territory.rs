@@ -75,13 +75,19 @@ impl Block {
         let mut candidates = Vec::with_capacity(160);
         // Two cells each way: a site further off than that is beaten by the one in the point's own
         // cell, even within the border's reach.
-        cells(min, max, BUNDLE_SPACING_NM, 2, |cell| candidates.push(bundle(seed, cell)));
-        cells(min, max, SOMA_SPACING_NM, 1, |cell| candidates.extend(soma(seed, cell)));
+        cells(min, max, BUNDLE_SPACING_NM, 2, |cell| {
+            candidates.push(bundle(seed, cell))
+        });
+        cells(min, max, SOMA_SPACING_NM, 1, |cell| {
+            candidates.extend(soma(seed, cell))
+        });
         vessels(seed, min, max, &mut candidates);
 
         let nearest = |c: DVec3| (c.clamp(min, max) - c).length_squared();
         let furthest = |c: DVec3| (c - min).abs().max((c - max).abs()).length_squared();
-        let bound = candidates.iter().map(|t| furthest(t.centre) - t.radius * t.radius);
+        let bound = candidates
+            .iter()
+            .map(|t| furthest(t.centre) - t.radius * t.radius);
         let bound = bound.fold(f64::INFINITY, f64::min);
         let owner_reach = (bound.max(0.0) + LARGEST_RADIUS_NM * LARGEST_RADIUS_NM).sqrt();
         candidates.retain(|t| {
@@ -95,7 +101,10 @@ impl Block {
     pub(super) fn at(&self, point: DVec3) -> Here {
         let mut owner = &self.candidates[0];
         if self.candidates.len() == 1 {
-            return Here { territory: *owner, border_nm: f64::INFINITY };
+            return Here {
+                territory: *owner,
+                border_nm: f64::INFINITY,
+            };
         }
         let mut least = owner.distance(point);
         for candidate in &self.candidates[1..] {
@@ -115,12 +124,19 @@ impl Block {
                 }
             }
         }
-        Here { territory: *owner, border_nm: within_reach(border_nm) }
+        Here {
+            territory: *owner,
+            border_nm: within_reach(border_nm),
+        }
     }
 }
 
 fn within_reach(border_nm: f64) -> f64 {
-    if border_nm < BORDER_REACH_NM { border_nm } else { f64::INFINITY }
+    if border_nm < BORDER_REACH_NM {
+        border_nm
+    } else {
+        f64::INFINITY
+    }
 }
 
 /// Calls `each` with the lattice cells that hold a box, and `around` more on every side.
@@ -144,7 +160,12 @@ fn jittered(cell: IVec3, bits: u64, by: f64) -> DVec3 {
 fn bundle(seed: u64, cell: IVec3) -> Territory {
     let id = hash(seed ^ 0x0b0d_1e5a, cell);
     let centre = jittered(cell, id, 0.4) * BUNDLE_SPACING_NM;
-    Territory { tissue: Tissue::Bundle, id: id.max(1), centre, radius: 0.0 }
+    Territory {
+        tissue: Tissue::Bundle,
+        id: id.max(1),
+        centre,
+        radius: 0.0,
+    }
 }
 
 fn soma(seed: u64, cell: IVec3) -> Option<Territory> {
@@ -154,7 +175,12 @@ fn soma(seed: u64, cell: IVec3) -> Option<Territory> {
     }
     let radius = 2_300.0 + 1_200.0 * unit(mix(id), 0);
     let centre = jittered(cell, id, 0.2) * SOMA_SPACING_NM;
-    Some(Territory { tissue: Tissue::Soma, id: id.max(1), centre, radius })
+    Some(Territory {
+        tissue: Tissue::Soma,
+        id: id.max(1),
+        centre,
+        radius,
+    })
 }
 
 /// The links of all vessels that come near a box. Vessels wander along z, one per column at most.
@@ -185,7 +211,12 @@ fn vessels(seed: u64, min: DVec3, max: DVec3, into: &mut Vec<Territory>) {
         for link in first..=last {
             let centre = course(f64::from(link) * step);
             if (centre.clamp(min, max) - centre).length() < REACH_NM {
-                into.push(Territory { tissue: Tissue::Vessel, id: id.max(1), centre, radius });
+                into.push(Territory {
+                    tissue: Tissue::Vessel,
+                    id: id.max(1),
+                    centre,
+                    radius,
+                });
             }
         }
     });
@@ -195,6 +226,8 @@ fn vessels(seed: u64, min: DVec3, max: DVec3, into: &mut Vec<Territory>) {
 pub(super) fn bundles(seed: u64, min: DVec3, max: DVec3) -> Vec<Territory> {
     let mut found = Vec::new();
     // A point's owner sits at most two cells from the point's own cell.
-    cells(min, max, BUNDLE_SPACING_NM, 2, |cell| found.push(bundle(seed, cell)));
+    cells(min, max, BUNDLE_SPACING_NM, 2, |cell| {
+        found.push(bundle(seed, cell))
+    });
     found
 }
