@@ -1,0 +1,144 @@
+//! Bricks with border, assembled from the chunks that hold their voxels.
+//!
+//! Pure functions: no cache, no clock, no source. Chunks may have any size.
+
+use glam::UVec3;
+use saccade_core::brick::{
+    BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS, BrickId,
+};
+use saccade_core::levels::Level;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use saccade_render::BrickVoxels;
+use saccade_source::{Chunk, ChunkId};
+
+const EDGE: usize = BRICK_STORED_EDGE as usize;
+
+/// Voxels of the level that a brick stores, its border included, cut at the volume's ends.
+///
+/// Stored voxel `i` of a brick is voxel `32 * brick - 1 + i` of the level; those outside of the
+/// volume repeat the volume's nearest voxel, so they need no data of their own.
+pub fn stored_voxels(id: BrickId, level: &Level) -> VoxelBox {
+    let first = id.brick() * BRICK_EDGE;
+    let min = first.saturating_sub(UVec3::splat(BRICK_BORDER));
+    let max = first
+        .saturating_add(UVec3::splat(BRICK_EDGE + BRICK_BORDER))
+        .min(level.extent);
+    VoxelBox::new(min, max)
+}
+
+/// The chunks that hold a brick's stored voxels, x fastest; none for a brick outside of the volume.
+pub fn chunks_of(id: BrickId, volume: &Volume) -> impl Iterator<Item = ChunkId> + use<> {
+    let level = volume.levels.get(id.level() as usize);
+    let exists = (id.channel() as usize) < volume.channels.len();
+    let inside = level.filter(|level| exists && !id.voxels(level).is_empty());
+    let stored = inside.map_or(VoxelBox::EMPTY, |level| stored_voxels(id, level));
+    let (channel, level) = (id.channel(), id.level());
+    stored.cells(volume.chunk).map(move |chunk| ChunkId {
+        channel,
+        level,
+        chunk,
+    })
+}
+
+/// Assembles bricks one after another in the same memory.
+#[derive(Debug, Default)]
+pub struct Assembler {
+    voxels: Vec<u8>,
+}
+
+impl Assembler {
+    /// The voxels of a brick of an 8-bit volume, from its chunks as `chunk` finds them.
+    ///
+    /// `None` when `chunk` lacks one of [`chunks_of`]. A brick without a single measured voxel is
+    /// [`BrickVoxels::Empty`]; where every chunk is empty, no memory is touched to find that out.
+    pub fn assemble<'c>(
+        &mut self,
+        id: BrickId,
+        volume: &Volume,
+        chunk: impl Fn(ChunkId) -> Option<&'c Chunk>,
+    ) -> Option<BrickVoxels<'_>> {
+        let mut filled = Vec::new();
+        for chunk_id in chunks_of(id, volume) {
+            if let Chunk::Voxels(voxels) = chunk(chunk_id)? {
+                filled.push((chunk_id, voxels));
+            }
+        }
+        let Some(level) = volume.levels.get(id.level() as usize) else {
+            return Some(BrickVoxels::Empty);
+        };
+        if filled.is_empty() {
+            return Some(BrickVoxels::Empty);
+        }
+        self.voxels.clear();
+        self.voxels.resize(BRICK_STORED_VOXELS, 0);
+        let stored = stored_voxels(id, level);
+        for (chunk_id, voxels) in filled {
+            let min = chunk_id.chunk * volume.chunk;
+            let of_chunk = VoxelBox::new(min, min.saturating_add(volume.chunk));
+            copy_box(
+                id,
+                stored.intersection(of_chunk),
+                of_chunk,
+                voxels,
+                &mut self.voxels,
+            );
+        }
+        if self.voxels.iter().all(|&v| v == 0) {
+            return Some(BrickVoxels::Empty);
+        }
+        replicate_ends(id, stored, &mut self.voxels);
+        Some(BrickVoxels::Voxels(&self.voxels))
+    }
+}
+
+/// Index in a brick of the voxel `at` of its level, along each axis.
+fn stored_index(id: BrickId, at: UVec3) -> [usize; 3] {
+    (at + BRICK_BORDER - id.brick() * BRICK_EDGE)
+        .to_array()
+        .map(|i| i as usize)
+}
+
+/// Copies the voxels of `part` from a chunk that covers `of_chunk`.
+fn copy_box(id: BrickId, part: VoxelBox, of_chunk: VoxelBox, chunk: &[u8], brick: &mut [u8]) {
+    if part.is_empty() {
+        return;
+    }
+    let [x, y, z] = stored_index(id, part.min);
+    let [width, height, depth] = part.size().to_array().map(|s| s as usize);
+    let [cx, cy, cz] = (part.min - of_chunk.min).to_array().map(|i| i as usize);
+    let [row, rows, _] = of_chunk.size().to_array().map(|s| s as usize);
+    for dz in 0..depth {
+        for dy in 0..height {
+            let to = ((z + dz) * EDGE + y + dy) * EDGE + x;
+            let from = ((cz + dz) * rows + cy + dy) * row + cx;
+            brick[to..to + width].copy_from_slice(&chunk[from..from + width]);
+        }
+    }
+}
+
+/// Repeats the volume's outermost voxels into the part of a brick that lies outside of it.
+fn replicate_ends(id: BrickId, stored: VoxelBox, brick: &mut [u8]) {
+    let [x0, y0, z0] = stored_index(id, stored.min);
+    let [x1, y1, z1] = stored_index(id, stored.max - 1);
+    for z in z0..=z1 {
+        for y in y0..=y1 {
+            let row = &mut brick[(z * EDGE + y) * EDGE..][..EDGE];
+            let (first, last) = (row[x0], row[x1]);
+            row[..x0].fill(first);
+            row[x1 + 1..].fill(last);
+        }
+        let slice = &mut brick[z * EDGE * EDGE..][..EDGE * EDGE];
+        for y in (0..y0).chain(y1 + 1..EDGE) {
+            let from = y.clamp(y0, y1) * EDGE;
+            slice.copy_within(from..from + EDGE, y * EDGE);
+        }
+    }
+    for z in (0..z0).chain(z1 + 1..EDGE) {
+        let from = z.clamp(z0, z1) * EDGE * EDGE;
+        brick.copy_within(from..from + EDGE * EDGE, z * EDGE * EDGE);
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,241 @@
+//! What values a volume has, from a few of its chunks.
+
+use std::collections::BTreeSet;
+
+use futures::StreamExt;
+use saccade_core::levels::Level;
+use saccade_core::transfer::Histogram;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use saccade_source::{Chunk, ChunkId, VolumeSource};
+
+/// Chunks read of the coarsest level, to find where data are.
+const COARSE_CHUNKS: usize = 8;
+/// Chunks counted.
+const COUNTED_CHUNKS: usize = 12;
+/// The counted level has at most so many voxels along an axis: about what a first look shows.
+/// Coarser ones are so blurred that thin structures are gone.
+const COUNTED_EXTENT: u32 = 512;
+/// Reads at once.
+const CONCURRENT: usize = 4;
+
+/// Values counted in a part of a volume.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Sample {
+    /// Counts of the values of channel 0.
+    pub histogram: Histogram,
+    /// Whether a chunk that should be in it could not be read yet, but may be later.
+    pub partial: bool,
+}
+
+/// Counts values where the coarsest level has data, in a few chunks of a level of medium
+/// resolution. Depends on nothing but the voxels: the same volume gives the same sample.
+pub async fn sample(source: &dyn VolumeSource) -> Sample {
+    let volume = source.volume();
+    let mut result = Sample::default();
+    let Some((coarsest, counted)) = levels(volume) else {
+        return result;
+    };
+    let all = VoxelBox::of_size(volume.chunks(coarsest as usize)).iter();
+    let all: BTreeSet<Ordered> = all.map(|chunk| ordered(coarsest, chunk)).collect();
+    let mut places = BTreeSet::new();
+    for (id, chunk) in read(source, spread(&all, COARSE_CHUNKS), &mut result.partial).await {
+        places.extend(places_with_data(volume, id, &chunk, counted));
+    }
+    for (id, chunk) in read(source, spread(&places, COUNTED_CHUNKS), &mut result.partial).await {
+        count(volume, id, &chunk, &mut result.histogram);
+    }
+    result
+}
+
+/// The coarsest level, and the one to count: the finest of moderate size.
+fn levels(volume: &Volume) -> Option<(u32, u32)> {
+    let coarsest = volume.levels.len().checked_sub(1)?;
+    let moderate = |level: &Level| level.extent.max_element() <= COUNTED_EXTENT;
+    let counted = volume.levels.iter().position(moderate).unwrap_or(coarsest);
+    Some((u32::try_from(coarsest).ok()?, u32::try_from(counted).ok()?))
+}
+
+/// Chunks by level, z, y, x.
+type Ordered = (u32, [u32; 3]);
+
+fn ordered(level: u32, chunk: glam::UVec3) -> Ordered {
+    (level, [chunk.z, chunk.y, chunk.x])
+}
+
+/// At most `count` of them, at even distances.
+fn spread(chunks: &BTreeSet<Ordered>, count: usize) -> Vec<ChunkId> {
+    let step = chunks.len().div_ceil(count).max(1);
+    let chosen = chunks.iter().skip(step / 2).step_by(step);
+    let id = |&(level, [z, y, x]): &Ordered| ChunkId {
+        channel: 0,
+        level,
+        chunk: [x, y, z].into(),
+    };
+    chosen.map(id).collect()
+}
+
+async fn read(
+    source: &dyn VolumeSource,
+    ids: Vec<ChunkId>,
+    partial: &mut bool,
+) -> Vec<(ChunkId, Vec<u8>)> {
+    let reads: Vec<_> = ids
+        .into_iter()
+        .map(|id| async move { (id, source.read(id).await) })
+        .collect();
+    let answers: Vec<_> = futures::stream::iter(reads)
+        .buffered(CONCURRENT)
+        .collect()
+        .await;
+    let mut chunks = Vec::new();
+    for (id, answer) in answers {
+        match answer {
+            Ok(Chunk::Voxels(voxels)) => chunks.push((id, voxels.to_vec())),
+            Ok(Chunk::Empty) => {}
+            Err(error) => *partial |= error.is_transient(),
+        }
+    }
+    chunks
+}
+
+/// Rows of the chunk's voxels inside of the volume, with the first voxel of each.
+fn rows<'c>(
+    volume: &'c Volume,
+    id: ChunkId,
+    chunk: &'c [u8],
+) -> impl Iterator<Item = (glam::UVec3, &'c [u8])> {
+    let inside = id.voxels(volume).unwrap_or(VoxelBox::EMPTY);
+    let [width, height, _] = volume.chunk.to_array().map(|edge| edge as usize);
+    let size = inside.size();
+    let starts = (0..size.z).flat_map(move |z| (0..size.y).map(move |y| (y, z)));
+    starts.filter_map(move |(y, z)| {
+        let from = (z as usize * height + y as usize) * width;
+        let row = chunk.get(from..from + size.x as usize)?;
+        Some((inside.min + glam::UVec3::new(0, y, z), row))
+    })
+}
+
+/// The chunks of `level` in the middle of each voxel of the chunk that has data.
+fn places_with_data(volume: &Volume, id: ChunkId, chunk: &[u8], level: u32) -> BTreeSet<Ordered> {
+    let (coarse, fine) = (
+        &volume.levels[id.level as usize],
+        &volume.levels[level as usize],
+    );
+    let mut places = BTreeSet::new();
+    for (start, row) in rows(volume, id, chunk) {
+        for (x, _) in (start.x..).zip(row).filter(|(_, value)| **value != 0) {
+            let at = glam::UVec3::new(x, start.y, start.z);
+            let level0 = coarse.voxels_from_box(VoxelBox::new(at, at + 1));
+            let voxels = fine.box_from_voxels(level0);
+            if !voxels.is_empty() {
+                let middle = voxels.min + voxels.size() / 2;
+                places.insert(ordered(level, middle / volume.chunk));
+            }
+        }
+    }
+    places
+}
+
+fn count(volume: &Volume, id: ChunkId, chunk: &[u8], histogram: &mut Histogram) {
+    for (_, row) in rows(volume, id, chunk) {
+        histogram.add(row);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use glam::{DVec3, UVec3};
+    use saccade_source::maybe_send::{BoxFuture, BoxStream};
+    use saccade_source::memory::ArraySource;
+    use saccade_source::{Change, ChunkError};
+
+    use super::*;
+
+    fn source(extent: UVec3, value: impl Fn(UVec3) -> u8) -> ArraySource {
+        let volume = Volume::new("v", extent, DVec3::ONE).unwrap();
+        let volume = Volume {
+            chunk: UVec3::new(32, 32, 16),
+            ..volume
+        };
+        let voxels = VoxelBox::of_size(extent).iter().map(value).collect();
+        ArraySource::new(volume, voxels).unwrap()
+    }
+
+    fn take(source: &dyn VolumeSource) -> Sample {
+        pollster::block_on(sample(source))
+    }
+
+    #[test]
+    fn a_small_volume_is_counted_where_its_data_are() {
+        let source = source(UVec3::new(70, 50, 33), |at| if at.x < 20 { 90 } else { 0 });
+        let Sample { histogram, partial } = take(&source);
+        assert!(!partial);
+        assert!(histogram.total() > 1000);
+        assert_eq!(
+            histogram.total(),
+            histogram.counts()[90],
+            "padding and nothing do not count"
+        );
+    }
+
+    #[test]
+    fn one_tile_in_a_large_volume_is_found() {
+        let corner = UVec3::new(1100, 60, 2);
+        let inside = move |at: UVec3| at.cmpge(corner).all() && at.x < 1130;
+        let source = source(
+            UVec3::new(1500, 90, 5),
+            move |at| if inside(at) { 200 } else { 0 },
+        );
+        let histogram = take(&source).histogram;
+        assert!(histogram.counts()[200] > 0);
+    }
+
+    #[test]
+    fn nothing_acquired_gives_an_empty_histogram() {
+        assert_eq!(take(&source(UVec3::splat(40), |_| 0)), Sample::default());
+    }
+
+    #[test]
+    fn the_same_voxels_give_the_same_sample() {
+        let value = |at: UVec3| u8::try_from((at.x * 13 + at.y * 7 + at.z) % 256).unwrap();
+        let grown = source(UVec3::new(90, 80, 70), |_| 0);
+        let whole = VoxelBox::of_size(UVec3::new(90, 80, 70));
+        take(&grown);
+        grown
+            .set(whole, &whole.iter().map(value).collect::<Vec<_>>())
+            .unwrap();
+        let fresh = source(UVec3::new(90, 80, 70), value);
+        assert_eq!(take(&grown), take(&fresh));
+        assert_ne!(take(&fresh), Sample::default());
+    }
+
+    /// Fails every read of the counted level.
+    struct Flaky(ArraySource);
+
+    impl VolumeSource for Flaky {
+        fn volume(&self) -> &Arc<Volume> {
+            self.0.volume()
+        }
+
+        fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+            if id.level == 0 {
+                let retry_after = std::time::Duration::ZERO;
+                return Box::pin(async move { Err(ChunkError::NotReady { id, retry_after }) });
+            }
+            self.0.read(id)
+        }
+
+        fn changes(&self) -> BoxStream<'static, Change> {
+            self.0.changes()
+        }
+    }
+
+    #[test]
+    fn what_could_not_be_read_is_told() {
+        let flaky = Flaky(source(UVec3::splat(70), |_| 9));
+        assert!(take(&flaky).partial);
+    }
+}

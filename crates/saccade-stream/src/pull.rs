@@ -1,0 +1,467 @@
+//! Misses in, requests out; answers in, bricks out.
+//!
+//! The pull as a state machine: it reads no clock, starts no task and waits for nothing, so that
+//! every order of events can be tested. [`crate::Session`] connects it to a source and a renderer.
+//!
+//! A brick's state follows from the states of its chunks; the README has the table.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use saccade_render::BrickVoxels;
+use saccade_source::{Chunk, ChunkError, ChunkId};
+
+use crate::brick::{Assembler, chunks_of};
+use crate::host_cache::{HostCache, bytes_of, is_touched};
+use crate::policy::{Budget, Limits};
+
+/// Names one request: an answer to any other is out of date.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Ticket(u64);
+
+/// A chunk to be asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Request {
+    /// To be given back with the answer.
+    pub ticket: Ticket,
+    /// What to read.
+    pub id: ChunkId,
+}
+
+/// What to do about the source now.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Actions {
+    /// Requests to start, most wanted first.
+    pub start: Vec<Request>,
+    /// Requests to drop; their answers will be ignored.
+    pub cancel: Vec<Ticket>,
+}
+
+/// Where a brick is on its way to the renderer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BrickState {
+    /// The newest report does not name it, or it was delivered since.
+    NotWanted,
+    /// Its turn has not come.
+    Wanted,
+    /// Some of its chunks are in flight or just arrived.
+    Loading,
+    /// A chunk failed for a passing reason and will be asked for again.
+    Waiting,
+    /// All its chunks are here.
+    Ready,
+    /// A chunk failed for good. Stays so until a change touches it.
+    Failed,
+}
+
+/// How far the pull is.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Progress {
+    /// Bricks that the newest report misses and that can still come.
+    pub wanted: usize,
+    /// Bricks that it misses and that cannot come before something changes.
+    pub failed: usize,
+    /// Chunk requests in flight.
+    pub in_flight: usize,
+    /// Chunk requests that wait to be repeated.
+    pub waiting: usize,
+    /// The newest failure, in words; none since the last change or success of the same chunk.
+    pub failure: Option<String>,
+    /// When to look again if nothing else happens.
+    pub retry_at: Option<Duration>,
+}
+
+/// What one call handed to the renderer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Delivery {
+    /// Bricks handed over.
+    pub bricks: usize,
+    /// Whether the budget ended it: there may be more.
+    pub cut: bool,
+}
+
+#[derive(Debug)]
+struct InFlight {
+    ticket: Ticket,
+    /// Report that last wanted it.
+    wanted_in: u64,
+    attempts: u32,
+}
+
+#[derive(Debug)]
+struct Backoff {
+    until: Duration,
+    attempts: u32,
+}
+
+/// The pull of one volume.
+pub struct Pull {
+    volume: Arc<Volume>,
+    limits: Limits,
+    /// Most wanted first.
+    wanted: Vec<BrickId>,
+    /// Frame whose misses `wanted` holds.
+    wanted_frame: Option<u64>,
+    reports: u64,
+    /// Bricks given to the renderer before this frame was drawn: older reports miss them in vain.
+    delivered: HashMap<BrickId, u64>,
+    /// Chunks of the bricks being loaded.
+    window: HashMap<ChunkId, Chunk>,
+    in_flight: BTreeMap<ChunkKey, InFlight>,
+    tickets: HashMap<Ticket, ChunkId>,
+    backoff: BTreeMap<ChunkKey, Backoff>,
+    failed: HashSet<ChunkId>,
+    failure: Option<(ChunkId, String)>,
+    cache: HostCache,
+    assembler: Assembler,
+    next_ticket: u64,
+}
+
+/// Failures kept in mind; beyond, all are forgotten and asked for again.
+const MAX_FAILED: usize = 1 << 16;
+
+/// A chunk id with an order: what happens must not depend on hash seeds.
+type ChunkKey = (u32, u32, [u32; 3]);
+
+fn key(id: ChunkId) -> ChunkKey {
+    (id.channel, id.level, id.chunk.to_array())
+}
+
+fn id_of((channel, level, chunk): ChunkKey) -> ChunkId {
+    ChunkId {
+        channel,
+        level,
+        chunk: chunk.into(),
+    }
+}
+
+impl Pull {
+    /// A pull that wants nothing yet.
+    pub fn new(volume: Arc<Volume>, limits: Limits) -> Self {
+        let cache = HostCache::new(limits.host_bytes / 2, chunk_bytes(&volume) as u64);
+        Self {
+            volume,
+            limits,
+            wanted: Vec::new(),
+            wanted_frame: None,
+            reports: 0,
+            delivered: HashMap::new(),
+            window: HashMap::new(),
+            in_flight: BTreeMap::new(),
+            tickets: HashMap::new(),
+            backoff: BTreeMap::new(),
+            failed: HashSet::new(),
+            failure: None,
+            cache,
+            assembler: Assembler::default(),
+            next_ticket: 0,
+        }
+    }
+
+    /// The misses of a frame, most wanted first. They replace those of earlier frames; a report
+    /// older than the newest is ignored.
+    pub fn want(&mut self, frame: u64, misses: &[BrickId]) {
+        if self.wanted_frame.is_some_and(|newest| frame < newest) {
+            return;
+        }
+        self.wanted_frame = Some(frame);
+        self.reports += 1;
+        self.delivered.retain(|_, before| *before > frame);
+        let mut seen = HashSet::with_capacity(misses.len());
+        let fresh = |id: &&BrickId| !self.delivered.contains_key(*id) && seen.insert(**id);
+        self.wanted = misses.iter().filter(fresh).copied().collect();
+    }
+
+    /// What to ask the source for now, and what no longer.
+    ///
+    /// The most wanted bricks whose chunks fit the memory for loading form a window: only their
+    /// chunks are asked for. At least one brick is in it, however small the memory.
+    pub fn plan(&mut self, now: Duration) -> Actions {
+        let mut actions = Actions::default();
+        let wanted = self.window_chunks();
+        let mut window = HashMap::with_capacity(wanted.len());
+        for &id in &wanted {
+            let here = self
+                .window
+                .remove(&id)
+                .or_else(|| self.cache.get(id).cloned());
+            if let Some(chunk) = here {
+                window.insert(id, chunk);
+            } else if let Some(in_flight) = self.in_flight.get_mut(&key(id)) {
+                in_flight.wanted_in = self.reports;
+            } else if self.in_flight.len() < self.limits.in_flight {
+                let backoff = self.backoff.get(&key(id));
+                if backoff.is_none_or(|b| b.until <= now) {
+                    actions.start.push(self.start(id));
+                }
+            }
+        }
+        self.window = window;
+        let (reports, grace) = (self.reports, self.limits.grace);
+        let mut cancel = |request: &InFlight| {
+            let forgotten = reports - request.wanted_in > grace;
+            if forgotten {
+                self.tickets.remove(&request.ticket);
+                actions.cancel.push(request.ticket);
+            }
+            !forgotten
+        };
+        self.in_flight.retain(|_, request| cancel(request));
+        // Nobody waits for a repetition of what nobody wants.
+        let wanted: HashSet<ChunkId> = wanted.into_iter().collect();
+        self.backoff
+            .retain(|&chunk, _| wanted.contains(&id_of(chunk)));
+        actions
+    }
+
+    fn start(&mut self, id: ChunkId) -> Request {
+        let ticket = Ticket(self.next_ticket);
+        self.next_ticket += 1;
+        let attempts = self.backoff.remove(&key(id)).map_or(0, |b| b.attempts);
+        self.in_flight.insert(
+            key(id),
+            InFlight {
+                ticket,
+                wanted_in: self.reports,
+                attempts,
+            },
+        );
+        self.tickets.insert(ticket, id);
+        Request { ticket, id }
+    }
+
+    /// Chunks of the most wanted bricks, in order of need, each once.
+    fn window_chunks(&self) -> Vec<ChunkId> {
+        let room = self.limits.host_bytes / 2;
+        let mut bytes = 0;
+        let mut chunks = Vec::new();
+        let mut seen: HashSet<ChunkId> = HashSet::new();
+        for &brick in &self.wanted {
+            if self.has_failed(brick) {
+                continue;
+            }
+            let new: Vec<ChunkId> = chunks_of(brick, &self.volume)
+                .filter(|id| !seen.contains(id))
+                .collect();
+            bytes += new.iter().map(|&id| self.bytes_expected(id)).sum::<u64>();
+            if bytes > room && !chunks.is_empty() {
+                break;
+            }
+            seen.extend(&new);
+            chunks.extend(new);
+        }
+        chunks
+    }
+
+    fn bytes_expected(&self, id: ChunkId) -> u64 {
+        let known = self.window.get(&id).or_else(|| self.cache.get(id));
+        known.map_or_else(|| chunk_bytes(&self.volume) as u64, bytes_of)
+    }
+
+    fn has_failed(&self, brick: BrickId) -> bool {
+        !self.failed.is_empty()
+            && chunks_of(brick, &self.volume).any(|id| self.failed.contains(&id))
+    }
+
+    /// Takes an answer. One that was cancelled, or began before a change of its voxels, is dropped.
+    pub fn answer(&mut self, ticket: Ticket, answer: Result<Chunk, ChunkError>, now: Duration) {
+        let Some(id) = self.tickets.remove(&ticket) else {
+            return;
+        };
+        let attempts = self
+            .in_flight
+            .remove(&key(id))
+            .map_or(0, |request| request.attempts);
+        match answer {
+            Ok(Chunk::Voxels(voxels)) if voxels.len() != chunk_bytes(&self.volume) => {
+                let want = chunk_bytes(&self.volume);
+                let message = format!("{id} has {} bytes instead of {want}", voxels.len());
+                self.fail(id, message);
+            }
+            Ok(chunk) => {
+                if self.failure.as_ref().is_some_and(|(of, _)| *of == id) {
+                    self.failure = None;
+                }
+                self.cache.insert(id, chunk.clone());
+                self.window.insert(id, chunk);
+            }
+            Err(error) if error.is_transient() => {
+                let asked = match &error {
+                    ChunkError::NotReady { retry_after, .. } => Some(*retry_after),
+                    _ => None,
+                };
+                let attempts = attempts.saturating_add(1);
+                let until = now + self.limits.retry.delay(attempts, asked);
+                self.backoff.insert(key(id), Backoff { until, attempts });
+                // A source that asks for patience has not failed.
+                if asked.is_none() {
+                    self.failure = Some((id, in_words(&error)));
+                }
+            }
+            Err(error) => self.fail(id, in_words(&error)),
+        }
+    }
+
+    fn fail(&mut self, id: ChunkId, message: String) {
+        if self.failed.len() >= MAX_FAILED {
+            self.failed.clear();
+        }
+        self.failed.insert(id);
+        self.failure = Some((id, message));
+    }
+
+    /// Voxels of level 0 changed: chunks that hold them are forgotten, and requests for them that
+    /// are in flight dropped, since they may have begun before. Returns the latter.
+    pub fn change(&mut self, voxels: VoxelBox) -> Vec<Ticket> {
+        let volume = &self.volume;
+        let touched = |id: ChunkId| is_touched(id, volume, voxels);
+        self.cache.invalidate(volume, voxels);
+        self.window.retain(|&id, _| !touched(id));
+        self.backoff.retain(|&chunk, _| !touched(id_of(chunk)));
+        self.failed.retain(|&id| !touched(id));
+        if self.failure.as_ref().is_some_and(|(id, _)| touched(*id)) {
+            self.failure = None;
+        }
+        let mut cancelled = Vec::new();
+        self.in_flight.retain(|&chunk, request| {
+            let drop = touched(id_of(chunk));
+            if drop {
+                cancelled.push(request.ticket);
+            }
+            !drop
+        });
+        for ticket in &cancelled {
+            self.tickets.remove(ticket);
+        }
+        cancelled
+    }
+
+    /// Hands ready bricks to `sink`, most wanted first, within the budget.
+    ///
+    /// `frame` is the next frame to be drawn: the first that will not miss them. `clock` tells the
+    /// time as given elsewhere.
+    pub fn deliver(
+        &mut self,
+        frame: u64,
+        clock: impl Fn() -> Duration,
+        mut sink: impl FnMut(BrickId, BrickVoxels<'_>),
+    ) -> Delivery {
+        let mut budget = Budget::new(&self.limits, clock());
+        let (volume, window) = (&self.volume, &self.window);
+        let before = self.wanted.len();
+        let mut open = true;
+        self.wanted.retain(|&brick| {
+            open = open && budget.allows(BRICK_STORED_VOXELS, clock());
+            if !open {
+                return true;
+            }
+            let voxels = self.assembler.assemble(brick, volume, |id| window.get(&id));
+            let Some(voxels) = voxels else {
+                return true;
+            };
+            budget.spend(match voxels {
+                BrickVoxels::Voxels(voxels) => voxels.len(),
+                BrickVoxels::Empty => 64,
+            });
+            sink(brick, voxels);
+            self.delivered.insert(brick, frame);
+            false
+        });
+        Delivery {
+            bricks: before - self.wanted.len(),
+            cut: !open,
+        }
+    }
+
+    /// Where a brick is.
+    pub fn state(&self, brick: BrickId) -> BrickState {
+        if !self.wanted.contains(&brick) {
+            return BrickState::NotWanted;
+        }
+        if self.has_failed(brick) {
+            return BrickState::Failed;
+        }
+        let mut state = BrickState::Ready;
+        let mut any_here = false;
+        for id in chunks_of(brick, &self.volume) {
+            if self.window.contains_key(&id) {
+                any_here = true;
+                continue;
+            }
+            let chunk = if self.backoff.contains_key(&key(id)) {
+                BrickState::Waiting
+            } else if self.in_flight.contains_key(&key(id)) {
+                BrickState::Loading
+            } else {
+                BrickState::Wanted
+            };
+            state = match (state, chunk) {
+                (BrickState::Waiting, _) | (_, BrickState::Waiting) => BrickState::Waiting,
+                (BrickState::Loading, _) | (_, BrickState::Loading) => BrickState::Loading,
+                _ => BrickState::Wanted,
+            };
+        }
+        if state == BrickState::Wanted && any_here {
+            BrickState::Loading
+        } else {
+            state
+        }
+    }
+
+    /// How far it is.
+    pub fn progress(&self) -> Progress {
+        let failed = self
+            .wanted
+            .iter()
+            .filter(|&&brick| self.has_failed(brick))
+            .count();
+        Progress {
+            wanted: self.wanted.len() - failed,
+            failed,
+            in_flight: self.in_flight.len(),
+            waiting: self.backoff.len(),
+            failure: self.failure.as_ref().map(|(_, message)| message.clone()),
+            retry_at: self.backoff.values().map(|b| b.until).min(),
+        }
+    }
+
+    /// Memory that chunks take \[bytes\]. One that is both being loaded and kept counts twice, though
+    /// it is there once.
+    pub fn host_bytes(&self) -> u64 {
+        #[expect(
+            clippy::iter_over_hash_type,
+            reason = "the order of a sum does not show"
+        )]
+        let window = self.window.values().map(bytes_of).sum::<u64>();
+        window + self.cache.bytes()
+    }
+}
+
+/// Bytes of a full chunk.
+fn chunk_bytes(volume: &Volume) -> usize {
+    let [x, y, z] = volume.chunk.to_array().map(|edge| edge as usize);
+    x.saturating_mul(y)
+        .saturating_mul(z)
+        .saturating_mul(volume.dtype.bytes())
+}
+
+/// An error with its sources, on one line.
+fn in_words(error: &dyn std::error::Error) -> String {
+    let mut words = error.to_string();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        words.push_str(": ");
+        words.push_str(&cause.to_string());
+        source = cause.source();
+    }
+    words
+}
+
+#[cfg(test)]
+mod simulation;
+#[cfg(test)]
+mod tests;

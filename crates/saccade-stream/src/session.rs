@@ -1,0 +1,382 @@
+//! A source, a renderer and the pull between them.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use saccade_core::transfer::{Histogram, TransferFunction};
+use saccade_core::volume::Volume;
+use saccade_render::wgpu::DeviceType;
+use saccade_render::{
+    Delivery, Fidelity, FrameReport, Gpu, MemoryUse, Renderer, RendererError, RendererOptions,
+    Statistics, View,
+};
+use saccade_source::VolumeSource;
+
+use crate::clock::Clock;
+use crate::policy::{Limits, Refresh};
+use crate::pull::{Progress, Pull};
+use crate::requests::{Event, Requests};
+
+/// Called, from any thread, when [`Session::frame`] would find something new.
+pub type Wake = Arc<dyn Fn() + Send + Sync>;
+
+/// What a session may use.
+#[derive(Clone)]
+pub struct SessionOptions {
+    /// Ceiling for GPU memory \[bytes\].
+    pub gpu_bytes: u64,
+    /// What the pull may take; [`Limits::host_bytes`] is the ceiling for main memory.
+    pub limits: Limits,
+    /// Pictures being drawn at once: 2 keeps a GPU busy, 1 answers the hand faster.
+    pub frames_in_flight: usize,
+    /// Called when there is something new.
+    pub wake: Wake,
+}
+
+impl Default for SessionOptions {
+    fn default() -> Self {
+        Self {
+            gpu_bytes: 512 << 20,
+            limits: Limits::default(),
+            frames_in_flight: 2,
+            wake: Arc::new(|| ()),
+        }
+    }
+}
+
+impl fmt::Debug for SessionOptions {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            gpu_bytes,
+            limits,
+            frames_in_flight,
+            wake: _,
+        } = self;
+        f.debug_struct("SessionOptions")
+            .field("gpu_bytes", gpu_bytes)
+            .field("limits", limits)
+            .field("frames_in_flight", frames_in_flight)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Why there is no session.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SessionError {
+    /// The volume cannot be drawn.
+    #[error("volume {name:?} cannot be drawn")]
+    Renderer {
+        /// Why.
+        source: RendererError,
+        /// The volume's name.
+        name: String,
+    },
+}
+
+/// When to call [`Session::frame`] again, if nobody wakes the caller before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Again {
+    /// With the next frame of the display.
+    Now,
+    /// After this time.
+    After(Duration),
+    /// Only when woken, or when the view changes.
+    WhenWoken,
+}
+
+/// How the picture and the pull are.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Status {
+    /// Frames drawn so far.
+    pub frame: u64,
+    /// Whether this call drew one.
+    pub drew: bool,
+    /// Whether the last frame drawn is known to hold everything it wanted, up to date.
+    pub complete: bool,
+    /// Whether nothing will change by itself: no data on the way, no frame being drawn. An
+    /// incomplete picture that is settled misses bricks that failed for good.
+    pub settled: bool,
+    /// Of the newest frame known about.
+    pub fidelity: Fidelity,
+    /// Level-of-detail bias in force in it.
+    pub lod_bias: f32,
+    /// The part of it that lack of GPU memory added.
+    pub memory_bias: f32,
+    /// Work of the newest frame known about.
+    pub statistics: Statistics,
+    /// GPU memory.
+    pub memory: MemoryUse,
+    /// Memory that chunks take \[bytes\].
+    pub host_bytes: u64,
+    /// Requests and failures.
+    pub progress: Progress,
+    /// The volume's revision after the newest change seen; none before the first.
+    pub revision: Option<u64>,
+    /// From submission of the newest frame known about until it was known.
+    pub frame_time: Option<Duration>,
+    /// Whether the GPU is gone: a new session on a new device is needed.
+    pub lost: bool,
+    /// When to call again.
+    pub again: Again,
+}
+
+/// A volume being shown. Methods are called inside of a Tokio runtime's context natively.
+pub struct Session {
+    renderer: Renderer,
+    pull: Pull,
+    requests: Requests,
+    clock: Clock,
+    refresh: Refresh,
+    histogram: Histogram,
+    transfer: TransferFunction,
+    transfer_is_automatic: bool,
+    frames_in_flight: usize,
+    /// Frames without a report, with the time of their submission.
+    pending: VecDeque<(u64, Duration)>,
+    drawn: u64,
+    drawn_view: Option<View>,
+    /// Whether the picture would differ if drawn again.
+    dirty: bool,
+    report: Option<FrameReport>,
+    revision: Option<u64>,
+    frame_time: Option<Duration>,
+}
+
+/// How long until it is worth looking whether the GPU has finished a frame.
+const POLL: Duration = Duration::from_millis(4);
+
+impl Session {
+    /// Starts listening to the source; nothing is drawn yet.
+    ///
+    /// # Errors
+    ///
+    /// [`SessionError`] when the volume or the ceiling does not suit the GPU.
+    pub fn new(
+        gpu: &Gpu,
+        source: Arc<dyn VolumeSource>,
+        options: SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let volume = source.volume().clone();
+        // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn.
+        let software = gpu.adapter().device_type == DeviceType::Cpu;
+        let renderer_options = RendererOptions {
+            memory_bytes: options.gpu_bytes,
+            bands: if software { 4 } else { 1 },
+            ..RendererOptions::default()
+        };
+        let mut renderer =
+            Renderer::new(gpu, volume.clone(), renderer_options).map_err(|source| {
+                SessionError::Renderer {
+                    source,
+                    name: volume.name.clone(),
+                }
+            })?;
+        let histogram = Histogram::default();
+        let transfer = histogram.transfer_function(volume.size_nm());
+        renderer.set_transfer_function(&transfer);
+        Ok(Self {
+            renderer,
+            pull: Pull::new(volume, options.limits),
+            requests: Requests::new(source, options.wake),
+            clock: Clock::start(),
+            refresh: Refresh::new(),
+            histogram,
+            transfer,
+            transfer_is_automatic: true,
+            frames_in_flight: options.frames_in_flight.max(1),
+            pending: VecDeque::new(),
+            drawn: 0,
+            drawn_view: None,
+            dirty: true,
+            report: None,
+            revision: None,
+            frame_time: None,
+        })
+    }
+
+    /// The volume shown.
+    pub fn volume(&self) -> &Arc<Volume> {
+        self.renderer.volume()
+    }
+
+    /// What draws: its output, its memory.
+    pub fn renderer(&self) -> &Renderer {
+        &self.renderer
+    }
+
+    /// Values of the volume, as far as a few chunks tell. Follows changes.
+    pub fn histogram(&self) -> &Histogram {
+        &self.histogram
+    }
+
+    /// Colours and opacities in force.
+    pub fn transfer_function(&self) -> &TransferFunction {
+        &self.transfer
+    }
+
+    /// Whether they follow the histogram.
+    pub fn is_transfer_function_automatic(&self) -> bool {
+        self.transfer_is_automatic
+    }
+
+    /// Sets colours and opacities; they no longer follow the histogram.
+    pub fn set_transfer_function(&mut self, transfer: TransferFunction) {
+        self.transfer_is_automatic = false;
+        self.put_transfer_function(transfer);
+    }
+
+    /// Lets colours and opacities follow the histogram, as they do at first.
+    pub fn set_automatic_transfer_function(&mut self) {
+        self.transfer_is_automatic = true;
+        self.put_transfer_function(self.histogram.transfer_function(self.volume().size_nm()));
+    }
+
+    fn put_transfer_function(&mut self, transfer: TransferFunction) {
+        if self.transfer != transfer {
+            self.renderer.set_transfer_function(&transfer);
+            self.transfer = transfer;
+            self.dirty = true;
+        }
+    }
+
+    /// Takes what arrived, asks for what is missing, draws if the picture would change.
+    pub fn frame(&mut self, view: &View) -> Status {
+        let reports = self.renderer.poll();
+        self.advance(view, reports)
+    }
+
+    /// [`Self::frame`] with the reports of frames that are finished.
+    pub(crate) fn advance(&mut self, view: &View, reports: Vec<FrameReport>) -> Status {
+        let now = self.clock.now();
+        self.take_events(now);
+        for report in reports {
+            self.take_report(report, now);
+        }
+        if self.refresh.starts(now) {
+            self.requests.sample();
+        }
+        self.requests.apply(self.pull.plan(now));
+        let cut = self.deliver();
+        // Delivered bricks make room for others' chunks.
+        self.requests.apply(self.pull.plan(now));
+
+        self.dirty |= self.drawn_view != Some(*view);
+        let free = self.pending.len() < self.frames_in_flight;
+        let drew = self.dirty && free && view.size.min_element() > 0;
+        if drew {
+            self.drawn = self.renderer.render(view);
+            self.drawn_view = Some(*view);
+            self.pending.push_back((self.drawn, now));
+            self.dirty = false;
+        }
+        self.status(now, drew, cut)
+    }
+
+    fn take_events(&mut self, now: Duration) {
+        while let Some(event) = self.requests.next() {
+            match event {
+                Event::Answer { ticket, answer } => self.pull.answer(ticket, answer, now),
+                Event::Change(change) => {
+                    self.revision = self.revision.max(Some(change.revision));
+                    let cancelled = self.pull.change(change.voxels);
+                    self.requests.cancel(&cancelled);
+                    self.renderer.invalidate(change.voxels);
+                    self.refresh.changed();
+                    self.dirty = true;
+                }
+                Event::Sample { sample, .. } => {
+                    if sample.partial {
+                        self.refresh.changed();
+                    }
+                    self.histogram = sample.histogram;
+                    if self.transfer_is_automatic {
+                        self.set_automatic_transfer_function();
+                    }
+                }
+            }
+        }
+    }
+
+    fn take_report(&mut self, report: FrameReport, now: Duration) {
+        while let Some(&(frame, submitted)) = self.pending.front()
+            && frame <= report.frame
+        {
+            self.frame_time = Some(now.saturating_sub(submitted));
+            self.pending.pop_front();
+        }
+        self.pull.want(report.frame, &report.misses);
+        // Where the tables themselves were missing, or the bias moved, only the next frame can
+        // tell which bricks it needs.
+        let blind = !report.is_complete() && report.misses.is_empty();
+        let bias = self.report.as_ref().map_or(0.0, |r| r.memory_bias);
+        self.dirty |= blind || bias != report.memory_bias;
+        self.report = Some(report);
+    }
+
+    /// Hands ready bricks to the renderer; whether there may be more.
+    fn deliver(&mut self) -> bool {
+        let (renderer, clock) = (&mut self.renderer, self.clock);
+        let sink = |id, voxels: saccade_render::BrickVoxels<'_>| match renderer.deliver(id, voxels)
+        {
+            Ok(Delivery::Resident | Delivery::Empty | Delivery::NoRoom) => {}
+            Err(error) => log::error!("a brick was refused: {error}"),
+        };
+        let delivery = self.pull.deliver(self.drawn + 1, || clock.now(), sink);
+        self.dirty |= delivery.bricks > 0;
+        delivery.cut
+    }
+
+    fn status(&self, now: Duration, drew: bool, cut: bool) -> Status {
+        let progress = self.pull.progress();
+        let report = self.report.as_ref();
+        let known = self.pending.is_empty() && !self.dirty;
+        let idle = progress.wanted == 0 && !self.requests.is_sampling();
+        let due = [progress.retry_at, self.refresh.due()];
+        let due = due
+            .into_iter()
+            .flatten()
+            .min()
+            .map(|at| at.saturating_sub(now));
+        let poll = (!self.pending.is_empty()).then_some(POLL);
+        let again = if cut || (self.dirty && self.pending.is_empty()) {
+            Again::Now
+        } else {
+            due.into_iter()
+                .chain(poll)
+                .min()
+                .map_or(Again::WhenWoken, Again::After)
+        };
+        Status {
+            frame: self.drawn,
+            drew,
+            complete: known && report.is_some_and(FrameReport::is_complete),
+            settled: known && idle && self.refresh.due().is_none(),
+            fidelity: report.map(|r| r.fidelity).unwrap_or_default(),
+            lod_bias: report.map_or(0.0, |r| r.lod_bias),
+            memory_bias: report.map_or(0.0, |r| r.memory_bias),
+            statistics: report.map(|r| r.statistics).unwrap_or_default(),
+            memory: self.renderer.memory(),
+            host_bytes: self.pull.host_bytes(),
+            progress,
+            revision: self.revision,
+            frame_time: self.frame_time,
+            lost: self.renderer.gpu().is_lost(),
+            again,
+        }
+    }
+
+    /// Reports of all frames drawn so far, once they are drawn.
+    #[cfg(not(target_family = "wasm"))]
+    pub(crate) async fn finish(&mut self) -> Vec<FrameReport> {
+        self.renderer.finish().await
+    }
+
+    /// Waits for something from the background.
+    #[cfg(not(target_family = "wasm"))]
+    pub(crate) async fn woken(&self) {
+        self.requests.woken().await;
+    }
+}
