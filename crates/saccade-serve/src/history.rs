@@ -1,4 +1,7 @@
 //! What changed in a volume: enough to tag chunks and to let clients catch up.
+//!
+//! Changes are told apart by their position in the order in which they came, not by revision: one
+//! revision may bring several, and "anything may have changed" has no revision of its own.
 
 use std::collections::VecDeque;
 
@@ -10,7 +13,7 @@ use saccade_source::{Change, ChangeReason};
 /// Changes kept for clients that come back.
 const KEPT: usize = 4096;
 
-/// The recent changes of one volume, and the latest revision of each of its regions.
+/// The recent changes of one volume, and when each of its regions changed last.
 #[derive(Debug)]
 pub(crate) struct History {
     log: VecDeque<Change>,
@@ -40,7 +43,7 @@ impl History {
             first: 0,
             resumable_from: revision,
             revision,
-            regions: Regions::new(volume, revision),
+            regions: Regions::new(volume),
             extent: volume.extent(),
         }
     }
@@ -58,8 +61,8 @@ impl History {
     /// Adds a change.
     pub(crate) fn push(&mut self, change: Change) {
         self.revision = self.revision.max(change.revision);
-        self.regions.touch(change.voxels, change.revision);
         self.log.push_back(change);
+        self.regions.touch(change.voxels, self.end());
         if self.log.len() > KEPT
             && let Some(gone) = self.log.pop_front()
         {
@@ -106,13 +109,13 @@ impl History {
         (unseen, now)
     }
 
-    /// The latest revision that touched any of these level-0 voxels, or a later one.
-    pub(crate) fn revision_of(&self, voxels: VoxelBox) -> u64 {
+    /// Position behind the last change that touched any of these level-0 voxels, or a later one.
+    pub(crate) fn last_touched(&self, voxels: VoxelBox) -> u64 {
         self.regions.latest(voxels)
     }
 }
 
-/// The latest revision per cell of a coarse grid: bounded for any volume and any number of changes.
+/// The last change per cell of a coarse grid: bounded for any volume and any number of changes.
 #[derive(Debug)]
 struct Regions {
     cell: UVec3,
@@ -124,7 +127,7 @@ impl Regions {
     /// At most 64³ cells: 2 MiB.
     const CELLS_PER_AXIS: u32 = 64;
 
-    fn new(volume: &Volume, revision: u64) -> Self {
+    fn new(volume: &Volume) -> Self {
         let extent = volume.extent();
         let edge = |extent: u32, chunk: u32| {
             let mut edge = chunk.max(1);
@@ -144,7 +147,7 @@ impl Regions {
         Self {
             cell,
             cells,
-            latest: vec![revision; count],
+            latest: vec![0; count],
         }
     }
 
@@ -157,9 +160,9 @@ impl Regions {
         })
     }
 
-    fn touch(&mut self, voxels: VoxelBox, revision: u64) {
+    fn touch(&mut self, voxels: VoxelBox, position: u64) {
         for index in self.indices(voxels) {
-            self.latest[index] = self.latest[index].max(revision);
+            self.latest[index] = self.latest[index].max(position);
         }
     }
 
@@ -258,27 +261,24 @@ mod tests {
         let here = VoxelBox::new(UVec3::new(4999, 0, 0), UVec3::new(5000, 1, 1));
         let far = VoxelBox::new(UVec3::ZERO, UVec3::ONE);
         history.push(change(9, 4999));
-        assert_eq!(
-            (history.revision_of(here), history.revision_of(far)),
-            (9, 3)
-        );
+        let touched = |history: &History| [here, far].map(|voxels| history.last_touched(voxels));
+        assert_eq!(touched(&history), [1, 0]);
         let whole = VoxelBox::of_size(volume.extent());
-        assert_eq!(history.revision_of(whole), 9);
+        assert_eq!(history.last_touched(whole), 1);
+        // What was missed has no revision of its own.
+        let missed = ChangeReason::Missed;
         history.push(Change {
-            revision: 12,
+            revision: 9,
             voxels: whole,
-            reason: ChangeReason::Missed,
+            reason: missed,
         });
-        assert_eq!(
-            (history.revision_of(here), history.revision_of(far)),
-            (12, 12)
-        );
+        assert_eq!(touched(&history), [2, 2]);
     }
 
     #[test]
     fn regions_stay_small_for_the_largest_volumes() {
         let extent = UVec3::new(2_000_000, 2_000_000, 250_000);
-        let regions = Regions::new(&Volume::new("v", extent, DVec3::ONE).unwrap(), 0);
+        let regions = Regions::new(&Volume::new("v", extent, DVec3::ONE).unwrap());
         assert!(regions.latest.len() <= 64 * 64 * 64);
         assert_eq!(regions.latest(VoxelBox::of_size(extent)), 0);
     }

@@ -48,5 +48,5 @@ mod volumes;
 mod zarr;
 
 pub use server::{Compress, Options, ServeError, Server};
-pub use status::{Quarantined, Status, StatusError, StatusSource};
+pub use status::{CatalogStatus, Quarantined, Status, StatusError, StatusSource};
 pub use volumes::Volumes;

@@ -36,7 +36,7 @@ pub enum Compress {
 impl Options {
     /// The usual ones.
     pub const DEFAULT: Self = Self {
-        patience: Duration::from_secs(30),
+        patience: Duration::from_secs(20),
         compress: Compress::FarClients,
     };
 }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use futures::future::BoxFuture;
+use saccade_archive::catalog::{Catalog, CatalogError};
 use serde::{Deserialize, Serialize};
 
 /// The state of a volume's acquisition.
@@ -14,6 +15,8 @@ pub struct Status {
     pub tiles: Option<u64>,
     /// Sections with at least one tile; `None` where the volume is not made of tiles.
     pub sections: Option<u64>,
+    /// Tiles that are announced but whose files are not whole yet; `None` likewise.
+    pub waiting: Option<u64>,
     /// Files that could not be taken in.
     pub quarantined: Vec<Quarantined>,
 }
@@ -45,4 +48,48 @@ pub trait StatusSource: Send + Sync {
     ///
     /// [`StatusError`], of the future.
     fn status(&self) -> BoxFuture<'_, Result<Status, StatusError>>;
+}
+
+/// Reads the state of a volume from a catalog.
+#[derive(Clone, Debug)]
+pub struct CatalogStatus {
+    catalog: Catalog,
+    volume: String,
+}
+
+impl CatalogStatus {
+    /// Of the volume of that name.
+    pub fn new(catalog: Catalog, volume: &str) -> Self {
+        Self {
+            catalog,
+            volume: volume.to_owned(),
+        }
+    }
+
+    async fn read(&self) -> Result<Status, CatalogError> {
+        let statistics = self.catalog.statistics(&self.volume).await?;
+        let quarantined = self.catalog.quarantined(&self.volume).await?;
+        let file = |q: saccade_archive::catalog::Quarantined| Quarantined {
+            file: q.file,
+            reason: q.reason,
+        };
+        Ok(Status {
+            revision: statistics.revision,
+            tiles: Some(statistics.tiles),
+            sections: Some(statistics.sections),
+            waiting: Some(statistics.waiting),
+            quarantined: quarantined.into_iter().map(file).collect(),
+        })
+    }
+}
+
+impl StatusSource for CatalogStatus {
+    fn status(&self) -> BoxFuture<'_, Result<Status, StatusError>> {
+        Box::pin(async {
+            self.read().await.map_err(|error| StatusError {
+                source: Arc::new(error),
+                volume: self.volume.clone(),
+            })
+        })
+    }
 }

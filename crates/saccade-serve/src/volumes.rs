@@ -7,13 +7,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use futures::StreamExt;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
-use saccade_source::{ChunkId, VolumeSource};
+use saccade_source::maybe_send::BoxStream;
+use saccade_source::{Change, ChunkId, VolumeSource};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::history::History;
 use crate::http::Tag;
-use crate::status::StatusSource;
+use crate::status::{StatusError, StatusSource};
 
 /// The volumes on offer, by name. Clones share the same set, which may grow at any time.
 #[derive(Clone, Default)]
@@ -27,20 +28,30 @@ impl Volumes {
 
     /// Offers a volume under the name it has, in place of one that had the name.
     ///
-    /// `revision` is the volume's now; later ones come with the source's changes. Must be called
-    /// within a Tokio runtime: a task follows the source until the volume is replaced.
-    pub fn publish(
+    /// `status` also knows the volume's revision, 0 without it. Must be called within a Tokio
+    /// runtime: a task follows the source until the volume is replaced.
+    ///
+    /// # Errors
+    ///
+    /// [`StatusError`] if the state cannot be read; the volume is then not offered.
+    pub async fn publish(
         &self,
         source: Arc<dyn VolumeSource>,
-        revision: u64,
         status: Option<Arc<dyn StatusSource>>,
-    ) {
-        let published = Arc::new(Published::new(source, revision, status));
+    ) -> Result<(), StatusError> {
+        // Listen first: a change that comes now is then in the revision, in the stream or in both.
+        let changes = source.changes();
+        let revision = match &status {
+            Some(status) => status.status().await?.revision,
+            None => 0,
+        };
+        let published = Arc::new(Published::new(source, changes, revision, status));
         let name = published.volume().name.clone();
         self.0
             .write()
             .unwrap_or_else(PoisonError::into_inner)
             .insert(name, published);
+        Ok(())
     }
 
     /// Names, in order.
@@ -86,12 +97,12 @@ pub(crate) struct Published {
 impl Published {
     fn new(
         source: Arc<dyn VolumeSource>,
+        mut changes: BoxStream<'static, Change>,
         revision: u64,
         status: Option<Arc<dyn StatusSource>>,
     ) -> Self {
         let history = Arc::new(Mutex::new(History::new(source.volume(), revision)));
         let (behind, end) = watch::channel(0);
-        let mut changes = source.changes();
         let name = source.volume().name.clone();
         let follower = tokio::spawn({
             let history = history.clone();
@@ -136,11 +147,12 @@ impl Published {
     pub(crate) fn tag(&self, id: ChunkId) -> Option<Tag> {
         let volume = self.volume();
         let level = volume.levels.get(usize::try_from(id.level).ok()?)?;
-        // Filters reach a voxel beyond the chunk.
-        let touched = level.voxels_from_box(id.voxels(volume)?.grown(1));
+        // Changes are boxes of level-0 voxels; the filters of coarser levels reach a voxel beyond.
+        let reach = u32::from(id.level > 0);
+        let touched = level.voxels_from_box(id.voxels(volume)?.grown(reach));
         let touched = touched.intersection(VoxelBox::of_size(volume.extent()));
-        let revision = self.history().revision_of(touched);
-        Some(Tag::new(&format!("{:016x}-{revision}", self.instance)))
+        let position = self.history().last_touched(touched);
+        Some(Tag::new(&format!("{:016x}-{position}", self.instance)))
     }
 }
 
