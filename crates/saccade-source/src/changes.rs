@@ -38,6 +38,11 @@ impl Changes {
             .unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
+    /// Revision of the newest change.
+    pub(crate) fn revision(&self) -> u64 {
+        *self.lock()
+    }
+
     /// Numbers a change with the next revision and sends it. Apply it before.
     pub(crate) fn send_next(&self, voxels: VoxelBox, reason: ChangeReason) -> u64 {
         let mut revision = self.lock();

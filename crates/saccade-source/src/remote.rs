@@ -3,6 +3,7 @@
 mod chunks;
 mod event_parser;
 mod events;
+mod status;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -19,6 +20,8 @@ use crate::conformance::check_volume;
 use crate::maybe_send::{BoxFuture, BoxStream, sleep, spawn};
 use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
 use chunks::Revisions;
+
+pub use status::{Quarantined, Status, StatusReader};
 
 /// Largest chunk a server may announce \[bytes\].
 const LARGEST_CHUNK: u64 = 1 << 28;
@@ -265,6 +268,10 @@ impl VolumeSource for RemoteSource {
 
     fn changes(&self) -> BoxStream<'static, Change> {
         self.changes.stream()
+    }
+
+    fn revision(&self) -> u64 {
+        self.changes.revision()
     }
 }
 

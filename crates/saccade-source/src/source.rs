@@ -168,6 +168,12 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
     /// [`ChangeReason::Missed`] covers the whole volume.
     fn changes(&self) -> BoxStream<'static, Change>;
 
+    /// Revision of the newest change told so far, or of the volume when it was opened. A read that
+    /// begins now sees that revision or a later one. 0 where nobody counts.
+    fn revision(&self) -> u64 {
+        0
+    }
+
     /// Bounds of a chunk's measured values, if they are known without reading voxels.
     fn value_range(&self, _id: ChunkId) -> Option<ValueRange> {
         None

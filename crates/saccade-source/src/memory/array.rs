@@ -143,6 +143,10 @@ impl VolumeSource for ArraySource {
         self.changes.stream()
     }
 
+    fn revision(&self) -> u64 {
+        self.changes.revision()
+    }
+
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
         let voxels = id.voxels(&self.volume)?;
         let extent = self.volume.levels[id.level as usize].extent;

@@ -121,4 +121,8 @@ impl VolumeSource for ProceduralSource {
     fn changes(&self) -> BoxStream<'static, Change> {
         self.changes.stream()
     }
+
+    fn revision(&self) -> u64 {
+        self.changes.revision()
+    }
 }
