@@ -113,8 +113,8 @@ pub struct Status {
     pub host_bytes: u64,
     /// Requests and failures.
     pub progress: Progress,
-    /// The volume's revision after the newest change seen; none before the first.
-    pub revision: Option<u64>,
+    /// The volume's revision after the newest change seen: the picture is to show it.
+    pub revision: u64,
     /// From submission of the newest frame known about until it was known.
     pub frame_time: Option<Duration>,
     /// Whether the GPU is gone: a new session on a new device is needed.
@@ -141,7 +141,7 @@ pub struct Session {
     /// Whether the picture would differ if drawn again.
     dirty: bool,
     report: Option<FrameReport>,
-    revision: Option<u64>,
+    revision: u64,
     frame_time: Option<Duration>,
 }
 
@@ -174,13 +174,16 @@ impl Session {
                     name: volume.name.clone(),
                 }
             })?;
+        let requests = Requests::new(source.clone(), options.wake);
+        // Asked after listening began: no change is lost between the two.
+        let revision = source.revision();
         let histogram = Histogram::default();
         let transfer = histogram.transfer_function(volume.size_nm());
         renderer.set_transfer_function(&transfer);
         Ok(Self {
             renderer,
             pull: Pull::new(volume, options.limits),
-            requests: Requests::new(source, options.wake),
+            requests,
             clock: Clock::start(),
             refresh: Refresh::new(),
             histogram,
@@ -192,7 +195,7 @@ impl Session {
             drawn_view: None,
             dirty: true,
             report: None,
-            revision: None,
+            revision,
             frame_time: None,
         })
     }
@@ -280,7 +283,7 @@ impl Session {
             match event {
                 Event::Answer { ticket, answer } => self.pull.answer(ticket, answer, now),
                 Event::Change(change) => {
-                    self.revision = self.revision.max(Some(change.revision));
+                    self.revision = self.revision.max(change.revision);
                     let cancelled = self.pull.change(change.voxels);
                     self.requests.cancel(&cancelled);
                     self.renderer.invalidate(change.voxels);
