@@ -122,6 +122,16 @@ impl RecordReader {
         len.saturating_sub(self.cursor.offset)
     }
 
+    /// Lines not yet read, as far as can be told without reading them: as many as of average length
+    /// fit the bytes not yet read.
+    pub fn remaining_lines(&self) -> u64 {
+        let bytes = self.remaining();
+        match self.cursor.line {
+            0 => bytes.div_ceil(160),
+            lines => bytes * lines / self.cursor.offset.max(1),
+        }
+    }
+
     fn read_lines(&mut self, max: usize) -> io::Result<Result<Vec<RecordLine>, AcquisitionError>> {
         let mut file = match File::open(&self.path) {
             Ok(file) => file,

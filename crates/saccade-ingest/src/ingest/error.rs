@@ -1,0 +1,54 @@
+use std::path::PathBuf;
+
+use saccade_archive::acquisition::AcquisitionError;
+use saccade_archive::catalog::CatalogError;
+use saccade_archive::storage::StorageError;
+use saccade_core::volume::VolumeError;
+
+/// Why ingest ended early. What was acknowledged is safe; starting again goes on from there.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum IngestError {
+    /// The acquisition archive cannot be used.
+    #[error(transparent)]
+    Acquisition(#[from] AcquisitionError),
+    /// The acquisition archive describes no volume that can be.
+    #[error("the acquisition archive describes no possible volume; mend {}", path.display())]
+    Volume {
+        /// What is wrong.
+        source: VolumeError,
+        /// Its `volume.json`.
+        path: PathBuf,
+    },
+    /// The catalog cannot be used.
+    #[error(transparent)]
+    Catalog(#[from] CatalogError),
+    /// A pyramid cannot be written.
+    #[error("the pyramid of tile {tile:?} cannot be written")]
+    Storage {
+        /// What went wrong.
+        source: StorageError,
+        /// The tile.
+        tile: String,
+    },
+    /// Two at work on one volume would do everything twice.
+    #[error(
+        "another process is ingesting into volume {volume:?}; end it first, or use another archive \
+         folder: {}",
+        path.display()
+    )]
+    AlreadyRunning {
+        /// The volume.
+        volume: String,
+        /// The file that the other one has locked.
+        path: PathBuf,
+    },
+    /// The lock file cannot be made.
+    #[error("cannot lock the archive; check its permissions and free space: {}", path.display())]
+    Lock {
+        /// What the system says.
+        source: std::io::Error,
+        /// The lock file.
+        path: PathBuf,
+    },
+}

@@ -1,0 +1,47 @@
+use std::time::Duration;
+
+use saccade_archive::pyramid::Encoding;
+
+/// How to ingest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct IngestOptions {
+    /// Name of the volume in the catalog; `None`: as the acquisition archive says.
+    pub volume: Option<String>,
+    /// How pyramids are stored.
+    pub encoding: Encoding,
+    /// Pause between looks at the acquisition archive.
+    pub poll: Duration,
+    /// Whether to end once everything that is there is done, instead of following.
+    pub once: bool,
+    /// Tiles in work at the same time. Each holds its file and its pixels in memory.
+    pub workers: usize,
+    /// Looks at an incomplete file that does not change any more, before it goes to quarantine.
+    pub patience: u32,
+    /// Records taken up per look.
+    pub batch: usize,
+    /// First pause after a failed write; pauses double up to sixteen of it.
+    pub retry: Duration,
+    /// How long a replaced pyramid stays, for readers that still have its name.
+    pub keep_retired: Duration,
+}
+
+impl IngestOptions {
+    /// What fits most.
+    pub const DEFAULT: Self = Self {
+        volume: None,
+        encoding: Encoding::Jpeg { quality: 85 },
+        poll: Duration::from_millis(250),
+        once: false,
+        workers: 2,
+        patience: 120,
+        batch: 1024,
+        retry: Duration::from_secs(1),
+        keep_retired: Duration::from_secs(60),
+    };
+}
+
+impl Default for IngestOptions {
+    fn default() -> Self {
+        Self::DEFAULT
+    }
+}

@@ -1,0 +1,321 @@
+//! One record on its own: everything up to the catalog. Never fails for what the record says; that
+//! becomes an outcome.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use glam::UVec3;
+use saccade_archive::acquisition::{TileRecord, TransformRecord, image_path};
+use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
+use saccade_archive::image::{self, ImageError};
+use saccade_archive::pyramid::{self, Encoding};
+use saccade_archive::storage::{Storage, StorageError};
+
+use super::IngestError;
+use crate::progress::Progress;
+
+/// What a file looks like from outside; another look means that someone writes to it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Look {
+    pub(super) bytes: u64,
+    modified: Option<SystemTime>,
+}
+
+/// Looks at a file; `None` if there is none, or none that may be seen.
+pub(super) fn look(path: &Path) -> Option<Look> {
+    let metadata = fs::metadata(path).ok()?;
+    Some(Look {
+        bytes: metadata.len(),
+        modified: metadata.modified().ok(),
+    })
+}
+
+/// What became of a record.
+#[derive(Debug)]
+pub(super) enum Outcome {
+    /// The pyramid is durable; the tile can be entered.
+    Tile { tile: NewTile, pixels: u64 },
+    /// The tile moves.
+    Transform {
+        record: TransformRecord,
+        position: u64,
+    },
+    /// The file is not whole yet.
+    Wait {
+        waiting: Waiting,
+        look: Option<Look>,
+        kind: WaitKind,
+    },
+    /// It cannot become a tile.
+    Quarantine {
+        what: Quarantined,
+        pyramid: Option<String>,
+    },
+}
+
+/// How long to wait for a file that does not change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum WaitKind {
+    /// It ends early: as long as the options say.
+    Incomplete,
+    /// It is damaged: until the next look, in case it was only being written.
+    Broken,
+}
+
+/// What all records share.
+pub(super) struct Context<'a> {
+    pub(super) folder: &'a Path,
+    pub(super) volume: &'a str,
+    pub(super) extent: UVec3,
+    pub(super) encoding: Encoding,
+    pub(super) storage: &'a dyn Storage,
+    pub(super) retry: Duration,
+    pub(super) progress: &'a dyn Progress,
+}
+
+impl Context<'_> {
+    /// Makes a tile of a record, up to its durable pyramid.
+    pub(super) async fn tile(
+        &self,
+        record: TileRecord,
+        position: u64,
+    ) -> Result<Outcome, IngestError> {
+        let Some(path) = image_path(self.folder, &record.file) else {
+            let reason = "the record names a file outside the acquisition archive; put the image \
+                          into the archive and name it relative to its folder";
+            return Ok(quarantine(&record, reason.to_owned(), None, None));
+        };
+        let (section, size, transform) = (record.section, record.size, record.transform);
+        let before = look(&path);
+        let bytes = before.map(|l| l.bytes);
+        if place(self.extent, section, size, transform).is_none() {
+            let reason = format!(
+                "the tile lies wholly outside the volume of {} voxels (section {section}, transform \
+                 {:?}); check its section, transform and the extent in volume.json",
+                self.extent,
+                transform.elements(),
+            );
+            return Ok(quarantine(&record, reason, bytes, None));
+        }
+        let name = pyramid_name(self.volume, &record, position);
+        let pyramid = {
+            let (path, record, encoding) = (path.clone(), record.clone(), self.encoding);
+            tokio::task::spawn_blocking(move || build(&path, &record, encoding)).await
+        };
+        let wait = |reason, kind| {
+            let waiting = Waiting {
+                position,
+                record: record.clone(),
+                reason,
+            };
+            Ok(Outcome::Wait {
+                waiting,
+                look: before,
+                kind,
+            })
+        };
+        let pyramid = match pyramid {
+            Ok(Ok(pyramid)) => pyramid,
+            Ok(Err(Refusal::Incomplete(reason))) => return wait(reason, WaitKind::Incomplete),
+            Ok(Err(Refusal::Broken(reason))) => return wait(reason, WaitKind::Broken),
+            Ok(Err(Refusal::Never(reason))) => {
+                return Ok(quarantine(&record, reason, bytes, Some(name)));
+            }
+            Err(panicked) => {
+                let reason = format!("decoding the image failed unexpectedly: {panicked}");
+                return Ok(quarantine(&record, reason, bytes, Some(name)));
+            }
+        };
+        self.write(&record.tile, &name, pyramid).await?;
+        let pixels = u64::from(size.x) * u64::from(size.y);
+        let tile = NewTile {
+            name: record.tile,
+            section,
+            size,
+            transform,
+            pyramid: name,
+            position,
+        };
+        Ok(Outcome::Tile { tile, pixels })
+    }
+
+    /// Writes a pyramid; waits as long as the disk is full.
+    async fn write(&self, tile: &str, name: &str, pyramid: Bytes) -> Result<(), IngestError> {
+        let mut backoff = Backoff::new(self.retry);
+        loop {
+            match self.storage.write_durable(name, pyramid.clone()).await {
+                Ok(()) => {
+                    if backoff.failures > 0 {
+                        self.progress.notice(&format!("tile {tile} is written now"));
+                    }
+                    return Ok(());
+                }
+                Err(e) => {
+                    let full = matches!(e, StorageError::Full { .. });
+                    if !backoff.may_go_on(full, e.is_transient()) {
+                        return Err(IngestError::Storage {
+                            source: e,
+                            tile: tile.to_owned(),
+                        });
+                    }
+                    backoff.say_and_wait(self.progress, &e).await;
+                }
+            }
+        }
+    }
+}
+
+/// Why there is no pyramid.
+enum Refusal {
+    Incomplete(String),
+    Broken(String),
+    Never(String),
+}
+
+fn build(path: &Path, record: &TileRecord, encoding: Encoding) -> Result<Bytes, Refusal> {
+    let image = image::decode_file(path).map_err(|e| match e {
+        ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
+        ImageError::Broken { .. } => Refusal::Broken(e.to_string()),
+        ImageError::Read { ref source, .. } => Refusal::Incomplete(format!("{e}: {source}")),
+        _ => Refusal::Never(e.to_string()),
+    })?;
+    if [image.width, image.height] != record.size.to_array() {
+        return Err(Refusal::Never(format!(
+            "the image has {} x {} pixels, but its record says {} x {}; mend the record or the image",
+            image.width, image.height, record.size.x, record.size.y,
+        )));
+    }
+    pyramid::encode(&image, &encoding).map_err(|e| Refusal::Never(e.to_string()))
+}
+
+pub(super) fn quarantine(
+    record: &TileRecord,
+    reason: String,
+    bytes: Option<u64>,
+    pyramid: Option<String>,
+) -> Outcome {
+    let (file, tile) = (record.file.clone(), Some(record.tile.clone()));
+    Outcome::Quarantine {
+        what: Quarantined {
+            file,
+            tile,
+            reason,
+            bytes,
+            at: SystemTime::now(),
+        },
+        pyramid,
+    }
+}
+
+/// The pyramid's name in the storage: the same for the same record, another for another record of
+/// the same tile, so that a pyramid that is being read is never written to.
+pub(super) fn pyramid_name(volume: &str, record: &TileRecord, position: u64) -> String {
+    let plain = |c: char| {
+        if c.is_ascii_alphanumeric() || "-_".contains(c) {
+            c
+        } else {
+            '_'
+        }
+    };
+    let tile: String = record.tile.chars().take(100).map(plain).collect();
+    format!(
+        "tiles/{volume}/{:06}/{tile}.{position:x}.tif",
+        record.section
+    )
+}
+
+/// Pauses between attempts: doubling, up to sixteen times the first.
+pub(super) struct Backoff {
+    pause: Duration,
+    longest: Duration,
+    pub(super) failures: u32,
+}
+
+impl Backoff {
+    /// Attempts at what may be a passing failure, before it counts as lasting.
+    const ATTEMPTS: u32 = 10;
+
+    pub(super) fn new(first: Duration) -> Self {
+        Self {
+            pause: first,
+            longest: first * 16,
+            failures: 0,
+        }
+    }
+
+    /// Counts a failure. A full disk is waited out; what may pass is tried some times.
+    pub(super) fn may_go_on(&mut self, full: bool, transient: bool) -> bool {
+        self.failures += 1;
+        full || (transient && self.failures < Self::ATTEMPTS)
+    }
+
+    pub(super) async fn say_and_wait(
+        &mut self,
+        progress: &dyn Progress,
+        error: &(dyn std::error::Error + Send + Sync + 'static),
+    ) {
+        if self.failures == 1 {
+            progress.notice(&format!(
+                "{}; trying again until it works",
+                with_sources(error)
+            ));
+        }
+        tokio::time::sleep(self.pause).await;
+        self.pause = (self.pause * 2).min(self.longest);
+    }
+}
+
+fn with_sources(error: &(dyn std::error::Error + 'static)) -> String {
+    let chain = std::iter::successors(Some(error), |e| e.source());
+    chain
+        .map(ToString::to_string)
+        .collect::<Vec<_>>()
+        .join(": ")
+}
+
+/// Where a record's image should be, if the record is sound.
+pub(super) fn path_of(folder: &Path, record: &TileRecord) -> Option<PathBuf> {
+    image_path(folder, &record.file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::UVec2;
+    use saccade_archive::storage::check_name;
+    use saccade_core::transform::SectionFromTile;
+
+    #[test]
+    fn every_record_has_its_own_pyramid_name() {
+        let record = |tile: &str| TileRecord {
+            tile: tile.to_owned(),
+            file: "a.tif".to_owned(),
+            section: 3,
+            size: UVec2::ONE,
+            transform: SectionFromTile::IDENTITY,
+        };
+        let wild = [
+            "a",
+            "../..",
+            "a/b",
+            "a\\b:c",
+            "",
+            ".",
+            "Zelle 7 µm",
+            &"n".repeat(999),
+        ];
+        let mut names: Vec<_> = (0..)
+            .zip(wild)
+            .flat_map(|(n, tile)| [n, n + 100].map(|at| pyramid_name("v.1", &record(tile), at)))
+            .collect();
+        for name in &names {
+            check_name(name).unwrap();
+            assert!(name.starts_with("tiles/v.1/000003/"), "{name}");
+        }
+        names.sort();
+        names.dedup();
+        assert_eq!(names.len(), 2 * wild.len());
+    }
+}

@@ -1,0 +1,240 @@
+//! Files that are not whole yet: when to look again, when to give up.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Duration;
+
+use saccade_archive::catalog::Waiting;
+
+use super::prepare::{Look, Outcome, WaitKind, look, path_of, quarantine};
+
+/// Longest pause between two looks at a file \[polls\].
+const LONGEST_PAUSE: u64 = 16;
+
+/// The records that wait, and what their files looked like.
+#[derive(Debug)]
+pub(super) struct WaitingRoom {
+    records: BTreeMap<u64, Guest>,
+    poll: u64,
+    patience: u64,
+    interval: Duration,
+}
+
+#[derive(Debug)]
+struct Guest {
+    waiting: Waiting,
+    /// At the last attempt to decode it; the outer `None`: not in this process.
+    look: Option<Option<Look>>,
+    kind: WaitKind,
+    /// Of the last change that was seen.
+    since: u64,
+    pause: u64,
+    next: u64,
+}
+
+/// What to do for a record that waits.
+#[derive(Debug)]
+pub(super) enum Due {
+    /// Its file changed: try again.
+    Retry(Waiting),
+    /// Its file has not changed for too long.
+    GiveUp { position: u64, outcome: Outcome },
+}
+
+impl WaitingRoom {
+    /// With the records that waited when an earlier process ended.
+    pub(super) fn new(patience: u32, interval: Duration, waiting: Vec<Waiting>) -> Self {
+        let records = waiting.into_iter().map(|waiting| {
+            let kind = WaitKind::Incomplete;
+            let guest = Guest {
+                waiting,
+                look: None,
+                kind,
+                since: 0,
+                pause: 1,
+                next: 0,
+            };
+            (guest.waiting.position, guest)
+        });
+        let records = records.collect();
+        Self {
+            records,
+            poll: 0,
+            patience: u64::from(patience),
+            interval,
+        }
+    }
+
+    pub(super) fn len(&self) -> u64 {
+        self.records.len() as u64
+    }
+
+    /// A record has to wait, for the first time or again.
+    pub(super) fn admit(&mut self, waiting: Waiting, look: Option<Look>, kind: WaitKind) {
+        let poll = self.poll;
+        let position = waiting.position;
+        let guest = Guest {
+            waiting,
+            look: Some(look),
+            kind,
+            since: poll,
+            pause: 1,
+            next: poll + 1,
+        };
+        self.records.insert(position, guest);
+    }
+
+    /// A record is done with, whatever became of it.
+    pub(super) fn leave(&mut self, position: u64) {
+        self.records.remove(&position);
+    }
+
+    /// One more poll: the records to do something for, at most `max`.
+    pub(super) fn due(&mut self, folder: &Path, max: usize) -> Vec<Due> {
+        self.poll += 1;
+        let poll = self.poll;
+        let mut due = Vec::new();
+        for guest in self.records.values_mut().filter(|g| g.next <= poll) {
+            if due.len() == max {
+                break;
+            }
+            let now = path_of(folder, &guest.waiting.record).and_then(|path| look(&path));
+            if guest.look != Some(now) {
+                // Not again before this attempt is over, which readmits it or lets it leave.
+                guest.next = u64::MAX;
+                due.push(Due::Retry(guest.waiting.clone()));
+                continue;
+            }
+            let patience = match guest.kind {
+                WaitKind::Incomplete => self.patience,
+                WaitKind::Broken => 1,
+            };
+            let unchanged = poll - guest.since;
+            if unchanged < patience {
+                guest.next = poll + guest.pause.min(patience - unchanged);
+                guest.pause = (guest.pause * 2).min(LONGEST_PAUSE);
+                continue;
+            }
+            guest.next = u64::MAX;
+            let Waiting {
+                position,
+                record,
+                reason,
+            } = &guest.waiting;
+            let polls = u32::try_from(unchanged).unwrap_or(u32::MAX);
+            let seconds = self.interval.saturating_mul(polls).as_secs_f64();
+            let reason = match guest.kind {
+                WaitKind::Incomplete => format!(
+                    "{reason}. The file has not changed for {seconds:.1} s; once it is mended, \
+                     append its record again"
+                ),
+                WaitKind::Broken => {
+                    format!("{reason}. Once the file is mended, append its record again")
+                }
+            };
+            let outcome = quarantine(record, reason, now.map(|l| l.bytes), None);
+            due.push(Due::GiveUp {
+                position: *position,
+                outcome,
+            });
+        }
+        due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::UVec2;
+    use saccade_archive::acquisition::TileRecord;
+    use saccade_core::transform::SectionFromTile;
+
+    fn waiting(position: u64, file: &str) -> Waiting {
+        let record = TileRecord {
+            tile: file.to_owned(),
+            file: file.to_owned(),
+            section: 0,
+            size: UVec2::ONE,
+            transform: SectionFromTile::IDENTITY,
+        };
+        Waiting {
+            position,
+            record,
+            reason: "it ends early".to_owned(),
+        }
+    }
+
+    fn room(patience: u32) -> WaitingRoom {
+        WaitingRoom::new(patience, Duration::from_secs(1), Vec::new())
+    }
+
+    #[test]
+    fn patience_ends_exactly_when_it_should() {
+        let folder = tempfile::tempdir().unwrap();
+        for patience in [1, 2, 7, 100] {
+            let mut room = room(patience);
+            room.admit(waiting(5, "missing.tif"), None, WaitKind::Incomplete);
+            for _ in 1..patience {
+                assert!(room.due(folder.path(), 9).is_empty());
+            }
+            let due = room.due(folder.path(), 9);
+            assert!(
+                matches!(due[..], [Due::GiveUp { position: 5, .. }]),
+                "{due:?}"
+            );
+            room.leave(5);
+            assert_eq!(room.len(), 0);
+        }
+    }
+
+    #[test]
+    fn a_growing_file_is_never_given_up() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tif");
+        let mut room = room(3);
+        let mut retries = 0;
+        room.admit(waiting(5, "a.tif"), None, WaitKind::Incomplete);
+        for poll in 0..60 {
+            if poll % 2 == 0 {
+                std::fs::write(&path, vec![0; poll + 1]).unwrap();
+            }
+            for due in room.due(folder.path(), 9) {
+                let Due::Retry(waiting) = due else {
+                    panic!("gave up at poll {poll}")
+                };
+                retries += 1;
+                room.admit(waiting, look(&path), WaitKind::Incomplete);
+            }
+        }
+        assert!(retries >= 20, "only {retries} attempts");
+    }
+
+    #[test]
+    fn a_broken_file_gets_one_more_look() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tif");
+        std::fs::write(&path, "x").unwrap();
+        let mut room = room(100);
+        room.admit(waiting(5, "a.tif"), look(&path), WaitKind::Broken);
+        assert!(matches!(
+            room.due(folder.path(), 9)[..],
+            [Due::GiveUp { .. }]
+        ));
+    }
+
+    #[test]
+    fn records_of_an_earlier_process_are_tried_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let guests = vec![waiting(1, "a.tif"), waiting(2, "b.tif")];
+        let mut room = WaitingRoom::new(9, Duration::from_secs(1), guests);
+        assert!(matches!(room.due(folder.path(), 1)[..], [Due::Retry(_)]));
+        assert!(
+            matches!(room.due(folder.path(), 9)[..], [Due::Retry(_)]),
+            "the other one"
+        );
+        assert!(
+            room.due(folder.path(), 9).is_empty(),
+            "both are being tried"
+        );
+    }
+}
