@@ -1,6 +1,24 @@
 //! Images as microscopes write them, decoded to 8-bit grey.
 
+//!
+//! [`decode`] tells a file that ends early, which whoever writes it may still complete, from one
+//! that is damaged and one that is of another kind: the first is waited for, the others are put
+//! aside with the reason. What cannot be told: uncompressed pixels of a file whose space was set
+//! aside before it was written are zeros like any others.
+//!
+//! Files may be hostile: no panic, and no more memory than a file of that many bytes can fill.
+
 use std::path::{Path, PathBuf};
+
+use sniff::Kind;
+
+mod jpeg;
+mod png;
+mod sniff;
+mod tiff;
+
+#[cfg(test)]
+mod tests;
 
 /// Largest width or height \[pixels\]: 12 levels above one sub-tile, whose sums fit 32 bits.
 pub const MAX_EDGE: u32 = 1 << 19;
@@ -30,8 +48,16 @@ impl GrayImage {
     /// If there are not `width * height` of them.
     pub fn new(width: u32, height: u32, voxels: Vec<u8>) -> Self {
         let want = u64::from(width) * u64::from(height);
-        assert_eq!(voxels.len() as u64, want, "an image of {width} x {height} has {want} voxels");
-        Self { width, height, voxels }
+        assert_eq!(
+            voxels.len() as u64,
+            want,
+            "an image of {width} x {height} has {want} voxels"
+        );
+        Self {
+            width,
+            height,
+            voxels,
+        }
     }
 }
 
@@ -63,6 +89,12 @@ pub enum ImageError {
         /// What it is.
         what: String,
     },
+    /// More pixels than memory.
+    #[error("the image needs {bytes} bytes of memory; cut it into smaller tiles, or add memory")]
+    Memory {
+        /// Bytes of the decoded image.
+        bytes: usize,
+    },
     /// The file could not be read at all.
     #[error("the image cannot be read; check that it exists and may be read: {}", path.display())]
     Read {
@@ -82,12 +114,17 @@ impl ImageError {
 
 /// Decodes a TIFF, PNG or JPEG file, told apart by its first bytes.
 ///
+/// Only the first image of a file is read. Colours become luma (Rec. 601); alpha is ignored.
+///
 /// # Errors
 ///
 /// [`ImageError`].
 pub fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
-    let _ = bytes;
-    Err(ImageError::Unsupported { what: "not yet".to_owned() })
+    match sniff::kind(bytes)? {
+        Kind::Tiff => tiff::decode(bytes),
+        Kind::Png => png::decode(bytes),
+        Kind::Jpeg => jpeg::decode(bytes),
+    }
 }
 
 /// Reads and decodes a file.
@@ -97,5 +134,53 @@ pub fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
 /// [`ImageError`].
 pub fn decode_file(path: &Path) -> Result<GrayImage, ImageError> {
     let read = std::fs::read(path);
-    decode(&read.map_err(|source| ImageError::Read { source, path: path.to_owned() })?)
+    decode(&read.map_err(|source| ImageError::Read {
+        source,
+        path: path.to_owned(),
+    })?)
+}
+
+/// The number of pixels, if it is one that a tile can have.
+fn check_size(width: u32, height: u32) -> Result<usize, ImageError> {
+    let edges = 1..=MAX_EDGE;
+    let pixels = usize::try_from(u64::from(width) * u64::from(height));
+    match pixels {
+        Ok(pixels) if edges.contains(&width) && edges.contains(&height) => Ok(pixels),
+        _ => Err(sniff::broken(format!(
+            "its size is {width} x {height} pixels"
+        ))),
+    }
+}
+
+/// Zeros, or an error where memory does not suffice.
+fn allocate(len: usize) -> Result<Vec<u8>, ImageError> {
+    let mut voxels = Vec::new();
+    let reserved = voxels.try_reserve_exact(len);
+    reserved.map_err(|_| ImageError::Memory { bytes: len })?;
+    voxels.resize(len, 0);
+    Ok(voxels)
+}
+
+/// Grey values of interleaved ones, in place.
+fn luma(mut samples: Vec<u8>, channels: usize) -> Vec<u8> {
+    let pixels = samples.len() / channels;
+    match channels {
+        1 => return samples,
+        2 => {
+            for pixel in 0..pixels {
+                samples[pixel] = samples[2 * pixel];
+            }
+        }
+        _ => {
+            for pixel in 0..pixels {
+                let [r, g, b] = [0, 1, 2].map(|c| u32::from(samples[channels * pixel + c]));
+                // Thousandths that add up to one: white stays 255.
+                let luma = (299 * r + 587 * g + 114 * b + 500) / 1000;
+                samples[pixel] = u8::try_from(luma).unwrap_or(u8::MAX);
+            }
+        }
+    }
+    samples.truncate(pixels);
+    samples.shrink_to_fit();
+    samples
 }

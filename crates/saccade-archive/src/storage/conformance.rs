@@ -13,7 +13,11 @@ use super::{Storage, StorageError};
 /// If the storage breaks its contract: this is a test.
 pub async fn check(storage: Arc<dyn Storage>) {
     let storage = storage.as_ref();
-    assert_eq!(names(storage, "").await, [""; 0], "begin with an empty storage");
+    assert_eq!(
+        names(storage, "").await,
+        [""; 0],
+        "begin with an empty storage"
+    );
     absent_objects_are_not_found(storage).await;
     objects_come_back_whole_and_in_parts(storage).await;
     later_writes_win(storage).await;
@@ -31,15 +35,27 @@ async fn names(storage: &dyn Storage, prefix: &str) -> Vec<String> {
 }
 
 async fn write(storage: &dyn Storage, name: &str, bytes: &'static [u8]) {
-    storage.write_durable(name, Bytes::from_static(bytes)).await.expect("write");
+    storage
+        .write_durable(name, Bytes::from_static(bytes))
+        .await
+        .expect("write");
 }
 
 async fn absent_objects_are_not_found(storage: &dyn Storage) {
     let read = storage.read("tiles/none.tif", None).await;
-    assert!(matches!(read, Err(StorageError::NotFound { .. })), "{read:?}");
+    assert!(
+        matches!(read, Err(StorageError::NotFound { .. })),
+        "{read:?}"
+    );
     let size = storage.size("tiles/none.tif").await;
-    assert!(matches!(size, Err(StorageError::NotFound { .. })), "{size:?}");
-    storage.delete("tiles/none.tif").await.expect("deleting what is absent is no error");
+    assert!(
+        matches!(size, Err(StorageError::NotFound { .. })),
+        "{size:?}"
+    );
+    storage
+        .delete("tiles/none.tif")
+        .await
+        .expect("deleting what is absent is no error");
 }
 
 async fn objects_come_back_whole_and_in_parts(storage: &dyn Storage) {
@@ -54,7 +70,10 @@ async fn objects_come_back_whole_and_in_parts(storage: &dyn Storage) {
         (Some(10..20), b""),
         (Some(u64::MAX - 1..u64::MAX), b""),
     ] {
-        let got = storage.read("tiles/a/b.tif", range.clone()).await.expect("read");
+        let got = storage
+            .read("tiles/a/b.tif", range.clone())
+            .await
+            .expect("read");
         assert_eq!(got, want, "{range:?}");
     }
     assert_eq!(storage.size("tiles/a/b.tif").await.expect("size"), 10);
@@ -65,14 +84,23 @@ async fn objects_come_back_whole_and_in_parts(storage: &dyn Storage) {
 async fn later_writes_win(storage: &dyn Storage) {
     write(storage, "again", b"a long first version").await;
     write(storage, "again", b"second").await;
-    assert_eq!(storage.read("again", None).await.expect("read"), b"second"[..]);
+    assert_eq!(
+        storage.read("again", None).await.expect("read"),
+        b"second"[..]
+    );
     storage.delete("again").await.expect("delete");
     let read = storage.read("again", None).await;
-    assert!(matches!(read, Err(StorageError::NotFound { .. })), "{read:?}");
+    assert!(
+        matches!(read, Err(StorageError::NotFound { .. })),
+        "{read:?}"
+    );
 }
 
 async fn lists_are_sorted_and_cut_by_prefix(storage: &dyn Storage) {
-    for name in ["l/b", "l/a/z", "l/a", "lone", "l/c"].into_iter().filter(|n| *n != "l/a") {
+    for name in ["l/b", "l/a/z", "l/a", "lone", "l/c"]
+        .into_iter()
+        .filter(|n| *n != "l/a")
+    {
         write(storage, name, b"x").await;
     }
     assert_eq!(names(storage, "l").await, ["l/a/z", "l/b", "l/c", "lone"]);
@@ -83,12 +111,28 @@ async fn lists_are_sorted_and_cut_by_prefix(storage: &dyn Storage) {
 }
 
 async fn bad_names_are_refused(storage: &dyn Storage) {
-    for name in ["", "/absolute", "..", "a/../../b", "a//b", "a/", ".hidden", "a\\b", "a\0b"] {
+    for name in [
+        "",
+        "/absolute",
+        "..",
+        "a/../../b",
+        "a//b",
+        "a/",
+        ".hidden",
+        "a\\b",
+        "a\0b",
+    ] {
         let refused = |error: Option<StorageError>, what: &str| {
-            assert!(matches!(error, Some(StorageError::Name { .. })), "{what} {name:?}: {error:?}");
+            assert!(
+                matches!(error, Some(StorageError::Name { .. })),
+                "{what} {name:?}: {error:?}"
+            );
         };
         refused(storage.read(name, None).await.err(), "read");
-        refused(storage.write_durable(name, Bytes::new()).await.err(), "write");
+        refused(
+            storage.write_durable(name, Bytes::new()).await.err(),
+            "write",
+        );
         refused(storage.delete(name).await.err(), "delete");
         refused(storage.size(name).await.err(), "size");
     }
@@ -97,16 +141,26 @@ async fn bad_names_are_refused(storage: &dyn Storage) {
 /// Two versions are written in turn while they are read: no reader sees anything else.
 async fn readers_see_whole_objects(storage: &dyn Storage) {
     let versions = [vec![1; 100_000], vec![2; 70_000]].map(Bytes::from);
-    storage.write_durable("busy", versions[0].clone()).await.expect("write");
+    storage
+        .write_durable("busy", versions[0].clone())
+        .await
+        .expect("write");
     let writer = async {
         for turn in 0..8 {
-            storage.write_durable("busy", versions[turn % 2].clone()).await.expect("write");
+            storage
+                .write_durable("busy", versions[turn % 2].clone())
+                .await
+                .expect("write");
         }
     };
     let reader = async {
         for _ in 0..16 {
             let seen = storage.read("busy", None).await.expect("read");
-            assert!(versions.contains(&seen), "a mixture of {} bytes was read", seen.len());
+            assert!(
+                versions.contains(&seen),
+                "a mixture of {} bytes was read",
+                seen.len()
+            );
         }
     };
     futures::join!(writer, reader);

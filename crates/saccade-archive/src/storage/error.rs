@@ -19,7 +19,9 @@ pub enum StorageError {
         path: String,
     },
     /// The system forbids it.
-    #[error("access is denied; check the owner and permissions, and that the disk is not mounted read-only: {path}")]
+    #[error(
+        "access is denied; check the owner and permissions, and that the disk is not mounted read-only: {path}"
+    )]
     Denied {
         /// What the system said.
         source: io::Error,
@@ -48,7 +50,9 @@ impl StorageError {
     /// Sorts what the system said into the caller's cases.
     pub(crate) fn new(source: io::Error, name: &str, path: String) -> Self {
         match source.kind() {
-            io::ErrorKind::NotFound => Self::NotFound { name: name.to_owned() },
+            io::ErrorKind::NotFound => Self::NotFound {
+                name: name.to_owned(),
+            },
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
                 Self::Full { source, path }
             }

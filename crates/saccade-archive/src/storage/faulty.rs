@@ -64,7 +64,10 @@ struct State {
 impl FaultyStorage {
     /// Wraps `inner`; without further orders nothing fails.
     pub fn new(inner: Arc<dyn Storage>) -> Self {
-        Self { inner, state: Arc::default() }
+        Self {
+            inner,
+            state: Arc::default(),
+        }
     }
 
     /// Orders `fault` for the `nth` write from now, 0 being the next.
@@ -111,7 +114,11 @@ impl FaultyStorage {
     }
 
     fn alive(&self, name: &str) -> Result<(), StorageError> {
-        if self.state().crashed { Err(failure("the storage has crashed", name)) } else { Ok(()) }
+        if self.state().crashed {
+            Err(failure("the storage has crashed", name))
+        } else {
+            Ok(())
+        }
     }
 
     fn next_write(&self, bytes: usize) -> Option<WriteFault> {
@@ -142,7 +149,10 @@ impl FaultyStorage {
 }
 
 fn failure(what: &'static str, name: &str) -> StorageError {
-    StorageError::Io { source: io::Error::other(what), path: name.to_owned() }
+    StorageError::Io {
+        source: io::Error::other(what),
+        path: name.to_owned(),
+    }
 }
 
 impl Storage for FaultyStorage {
@@ -193,7 +203,10 @@ impl Storage for FaultyStorage {
                     let kept = bytes.slice(..kept.min(bytes.len()));
                     self.inner.write_durable(name, kept).await?;
                     self.crash();
-                    Err(failure("the storage crashed in the middle of this write", name))
+                    Err(failure(
+                        "the storage crashed in the middle of this write",
+                        name,
+                    ))
                 }
             }
         }
@@ -254,10 +267,17 @@ mod tests {
             storage.fail_write(1, fault);
             storage.write_durable("first", OBJECT).await.unwrap();
             let error = storage.write_durable("second", OBJECT).await.unwrap_err();
-            assert_eq!(matches!(error, StorageError::Full { .. }), fault == WriteFault::Full);
+            assert_eq!(
+                matches!(error, StorageError::Full { .. }),
+                fault == WriteFault::Full
+            );
             let crashed = !matches!(fault, WriteFault::Fail | WriteFault::Full);
             assert_eq!(storage.has_crashed(), crashed, "{fault:?}");
-            assert_eq!(storage.read("first", None).await.is_err(), crashed, "{fault:?}");
+            assert_eq!(
+                storage.read("first", None).await.is_err(),
+                crashed,
+                "{fault:?}"
+            );
             storage.restart();
             assert_eq!(storage.read("first", None).await.unwrap(), OBJECT);
             let found = storage.read("second", None).await.ok();

@@ -36,7 +36,9 @@ impl LocalStorage {
     ///
     /// [`StorageError`] if the folder cannot be created or listed.
     pub fn new(root: impl Into<PathBuf>) -> Result<Self, StorageError> {
-        let storage = Self { root: root.into().into() };
+        let storage = Self {
+            root: root.into().into(),
+        };
         let incoming = storage.root.join(INCOMING);
         let failed = |e, path: &Path| StorageError::new(e, "", path.display().to_string());
         create_dirs(&incoming).map_err(|e| failed(e, &incoming))?;
@@ -92,7 +94,10 @@ impl LocalStorage {
     fn write_once(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
         static NEXT: AtomicU64 = AtomicU64::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let temporary = self.root.join(INCOMING).join(format!("{}-{number}", std::process::id()));
+        let temporary = self
+            .root
+            .join(INCOMING)
+            .join(format!("{}-{number}", std::process::id()));
         let write = || {
             let mut file = File::create(&temporary)?;
             // Tells a cleaner that the writer lives. Where locks do not exist, cleaners find none.
@@ -114,7 +119,10 @@ fn remove_if_abandoned(path: &Path) {
         && file.try_lock().is_ok()
         && let Err(e) = fs::remove_file(path)
     {
-        log::warn!("cannot remove an abandoned temporary file: {e}: {}", path.display());
+        log::warn!(
+            "cannot remove an abandoned temporary file: {e}: {}",
+            path.display()
+        );
     }
 }
 
@@ -123,7 +131,10 @@ fn create_dirs(path: &Path) -> io::Result<()> {
     if path.as_os_str().is_empty() || path.is_dir() {
         return Ok(());
     }
-    let parent = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let parent = path
+        .parent()
+        .filter(|p| !p.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
     create_dirs(parent)?;
     match fs::create_dir(path) {
         Err(e) if e.kind() == io::ErrorKind::AlreadyExists && path.is_dir() => Ok(()),
@@ -140,7 +151,9 @@ fn sync_dir(path: &Path) -> io::Result<()> {
 fn walk(dir: &Path, at: &str, prefix: &str, names: &mut Vec<String>) -> io::Result<()> {
     for entry in fs::read_dir(dir)? {
         let entry = entry?;
-        let Ok(part) = entry.file_name().into_string() else { continue };
+        let Ok(part) = entry.file_name().into_string() else {
+            continue;
+        };
         let name = format!("{at}{part}");
         if part.starts_with('.') {
             continue;
@@ -249,17 +262,25 @@ mod tests {
         let storage = LocalStorage::new(dir.path()).unwrap();
         // A folder stands where the object should go: the rename fails, after the data is written.
         fs::create_dir_all(dir.path().join("tiles/a.tif/x")).unwrap();
-        assert!(storage.write_durable("tiles/a.tif", Bytes::from_static(b"abc")).await.is_err());
+        assert!(
+            storage
+                .write_durable("tiles/a.tif", Bytes::from_static(b"abc"))
+                .await
+                .is_err()
+        );
         assert_eq!(fs::read_dir(dir.path().join(INCOMING)).unwrap().count(), 0);
     }
 
     #[tokio::test]
-    async fn links_out_of_the_folder_need_someone_with_access_to_it() {
+    async fn names_do_not_leave_the_folder() {
         let dir = tempfile::tempdir().unwrap();
         let storage = LocalStorage::new(dir.path()).unwrap();
         for name in ["../outside", "/etc/hostname", "a/../../outside"] {
             let read = storage.read(name, None).await;
-            assert!(matches!(read, Err(StorageError::Name { .. })), "{name}: {read:?}");
+            assert!(
+                matches!(read, Err(StorageError::Name { .. })),
+                "{name}: {read:?}"
+            );
             let write = storage.write_durable(name, Bytes::new()).await;
             assert!(matches!(write, Err(StorageError::Name { .. })), "{name}");
         }

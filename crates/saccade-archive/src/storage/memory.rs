@@ -28,7 +28,9 @@ impl MemoryStorage {
     fn get(&self, name: &str) -> Result<Bytes, StorageError> {
         check_name(name)?;
         let found = self.objects().get(name).cloned();
-        found.ok_or_else(|| StorageError::NotFound { name: name.to_owned() })
+        found.ok_or_else(|| StorageError::NotFound {
+            name: name.to_owned(),
+        })
     }
 }
 
@@ -65,7 +67,12 @@ impl Storage for MemoryStorage {
     }
 
     fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
-        let names = self.objects().keys().filter(|n| n.starts_with(prefix)).cloned().collect();
+        let names = self
+            .objects()
+            .keys()
+            .filter(|n| n.starts_with(prefix))
+            .cloned()
+            .collect();
         ready(Ok(names)).boxed()
     }
 

@@ -23,12 +23,18 @@ pub fn check_name(name: &str) -> Result<(), StorageError> {
         "a part of it begins with a dot"
     } else if name.split('/').any(|part| part.len() > MAX_PART) {
         "a part of it is longer than 240 bytes"
-    } else if name.chars().any(|c| c == '\\' || c == ':' || c.is_control()) {
+    } else if name
+        .chars()
+        .any(|c| c == '\\' || c == ':' || c.is_control())
+    {
         "it has a backslash, a colon or a control character"
     } else {
         return Ok(());
     };
-    Err(StorageError::Name { name: name.to_owned(), reason })
+    Err(StorageError::Name {
+        name: name.to_owned(),
+        reason,
+    })
 }
 
 #[cfg(test)]
@@ -37,16 +43,37 @@ mod tests {
 
     #[test]
     fn names_stay_below_the_root() {
-        for good in ["a", "tiles/a b.tif", "tiles/Ä/x..y.tif", &"n".repeat(MAX_PART)] {
+        for good in [
+            "a",
+            "tiles/a b.tif",
+            "tiles/Ä/x..y.tif",
+            &"n".repeat(MAX_PART),
+        ] {
             assert!(check_name(good).is_ok(), "{good:?}");
         }
         let long = "n".repeat(MAX_PART + 1);
         let deep = "n/".repeat(600) + "n";
         for bad in [
-            "", "/", "/a", "a/", "a//b", "..", "a/../b", "./a", ".incoming/a", "a\\b", "C:a",
-            "a\0b", "a\nb", &long, &deep,
+            "",
+            "/",
+            "/a",
+            "a/",
+            "a//b",
+            "..",
+            "a/../b",
+            "./a",
+            ".incoming/a",
+            "a\\b",
+            "C:a",
+            "a\0b",
+            "a\nb",
+            &long,
+            &deep,
         ] {
-            assert!(matches!(check_name(bad), Err(StorageError::Name { .. })), "{bad:?}");
+            assert!(
+                matches!(check_name(bad), Err(StorageError::Name { .. })),
+                "{bad:?}"
+            );
         }
     }
 }

@@ -1,0 +1,38 @@
+//! JPEG files. Of colours, the luma that they store is taken.
+
+use turbojpeg::{Decompressor, Image, PixelFormat};
+
+use super::sniff::{broken, check_jpeg};
+use super::{GrayImage, ImageError, allocate, check_size};
+
+/// Progressive files may refine the image as often as they like; this many times are enough.
+const MAX_SCANS: u32 = 500;
+
+pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
+    check_jpeg(bytes)?;
+    let mut decoder = Decompressor::new().map_err(broken)?;
+    decoder.set_scan_limit(MAX_SCANS).map_err(broken)?;
+    let header = decoder.read_header(bytes).map_err(broken)?;
+    let size = |len: usize| u32::try_from(len).map_err(broken);
+    let (width, height) = (size(header.width)?, size(header.height)?);
+    let pixels = check_size(width, height)?;
+    /// A block of 64 pixels takes two bits at least; runs of empty ones take less in refining
+    /// scans, but the first still names each row of blocks.
+    const MAX_RATIO: usize = 1 << 15;
+    if pixels / MAX_RATIO > bytes.len() {
+        return Err(broken(format!(
+            "{} bytes cannot hold {pixels} pixels",
+            bytes.len()
+        )));
+    }
+    let mut voxels = allocate(pixels)?;
+    let image = Image {
+        pixels: &mut voxels[..],
+        width: header.width,
+        pitch: header.width,
+        height: header.height,
+        format: PixelFormat::GRAY,
+    };
+    decoder.decompress(bytes, image).map_err(broken)?;
+    Ok(GrayImage::new(width, height, voxels))
+}

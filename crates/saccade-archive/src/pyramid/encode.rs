@@ -1,0 +1,262 @@
+//! An image's pyramid, made in one pass over its pixels.
+
+use bytes::Bytes;
+use glam::UVec2;
+use rayon::prelude::*;
+
+use super::codec::Encoder;
+use super::layout::{Coded, Parts};
+use super::mean::{
+    MAX_U16_LEVEL, SumPlane, Sums, covered, halve_pixels, halve_sums, means, quadrant,
+};
+use super::morton::in_morton_order;
+use super::{
+    EncodeError, Encoding, PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS, SubTileEntry, levels_of,
+};
+use crate::image::{GrayImage, MAX_EDGE};
+
+const EDGE: usize = SUB_TILE_EDGE as usize;
+
+/// Level of which one sub-tile, with all that it covers, is one thread's piece of work: a
+/// megapixel, small enough to share out, and its sums stay in the processor's cache.
+const TASK_LEVEL: usize = 3;
+const _: () = assert!(
+    TASK_LEVEL < MAX_U16_LEVEL,
+    "a task hands on the sums of the next level"
+);
+
+/// Makes the pyramid of an image, as the bytes of a TIFF file. Runs on rayon's threads.
+///
+/// # Errors
+///
+/// [`EncodeError`].
+pub fn encode(image: &GrayImage, encoding: &Encoding) -> Result<Bytes, EncodeError> {
+    Ok(parts(image, encoding)?.file())
+}
+
+pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, EncodeError> {
+    let (width, height) = (image.width, image.height);
+    let edges = 1..=MAX_EDGE;
+    let voxels = u64::from(width) * u64::from(height);
+    if !edges.contains(&width) || !edges.contains(&height) || voxels != image.voxels.len() as u64 {
+        return Err(EncodeError::Size {
+            width,
+            height,
+            voxels: image.voxels.len(),
+        });
+    }
+    let levels = levels_of(width, height);
+    let task_level = TASK_LEVEL.min(levels.len() - 1);
+    let tasks = in_morton_order(levels[task_level].sub_tiles);
+    let tasks = tasks.into_par_iter().map_init(
+        || None,
+        |encoder, at| {
+            let encoder = match encoder {
+                Some(encoder) => encoder,
+                None => encoder.insert(Encoder::new(encoding)?),
+            };
+            let mut task = Task::new(image, &levels, encoder);
+            task.sub_tile(task_level, at)?;
+            Ok((at, task.sums.pop(), task.done))
+        },
+    );
+    let tasks = tasks.collect::<Result<Vec<_>, EncodeError>>()?;
+
+    let mut coded: Vec<Vec<Coded>> = levels.iter().map(|_| Vec::new()).collect();
+    let mut plane = levels
+        .get(task_level + 1)
+        .map(|l| SumPlane::new(l.width, l.height));
+    for (at, sums, done) in tasks {
+        for (coded, done) in coded.iter_mut().zip(done) {
+            coded.push(done);
+        }
+        if let (Some(plane), Some(sums)) = (&mut plane, sums) {
+            plane.put(at, &sums);
+        }
+    }
+
+    // What is left is a 256th of the image.
+    let mut encoder = Encoder::new(encoding)?;
+    let mut task = Task::new(image, &levels, &mut encoder);
+    for level in task_level + 1..levels.len() {
+        let Some(sums) = plane.take() else { break };
+        let pixels = sums.means(level, (width, height));
+        for at in in_morton_order(levels[level].sub_tiles) {
+            task.encode_part(level, at, &pixels, sums.width)?;
+        }
+        plane = Some(sums.halved());
+    }
+    for (coded, done) in coded.iter_mut().zip(task.done).skip(task_level + 1) {
+        coded.push(done);
+    }
+    let blank = encoder.blank()?;
+    Ok(Parts {
+        levels,
+        coded,
+        blank,
+        jpeg_tables: encoder.tables().map(Into::into),
+    })
+}
+
+/// Encodes sub-tiles and what they cover.
+struct Task<'a> {
+    image: &'a GrayImage,
+    levels: &'a [PyramidLevel],
+    encoder: &'a mut Encoder,
+    /// Sums of the sub-tile at hand of levels 1 to the one above the task's.
+    sums: Vec<Box<Sums>>,
+    voxels: Box<[u8; SUB_TILE_VOXELS]>,
+    /// Finished sub-tiles per level.
+    done: Vec<Coded>,
+}
+
+impl<'a> Task<'a> {
+    fn new(image: &'a GrayImage, levels: &'a [PyramidLevel], encoder: &'a mut Encoder) -> Self {
+        let sums = (0..=TASK_LEVEL.min(levels.len() - 1)).map(|_| Box::new([0; SUB_TILE_VOXELS]));
+        Self {
+            image,
+            levels,
+            encoder,
+            sums: sums.collect(),
+            voxels: Box::new([0; SUB_TILE_VOXELS]),
+            done: levels.iter().map(|_| Coded::default()).collect(),
+        }
+    }
+
+    /// Encodes a sub-tile after all finer ones that it covers: the order of the curve, and each
+    /// pixel is still in the cache when its sum is needed.
+    fn sub_tile(&mut self, level: usize, at: UVec2) -> Result<(), EncodeError> {
+        let quadrant = quadrant(at.x, at.y);
+        let (width, height) = self.size(level, at);
+        let Some(finer) = level.checked_sub(1) else {
+            let image = self.image;
+            let pitch = image.width as usize;
+            self.encode_part(0, at, &image.voxels, pitch)?;
+            let corner = at.y as usize * EDGE * pitch + at.x as usize * EDGE;
+            let to = &mut self.sums[0][quadrant..];
+            halve_pixels(&image.voxels[corner..], pitch, (width, height), to);
+            return Ok(());
+        };
+        self.sums[finer].fill(0);
+        for (x, y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+            let at = at * 2 + UVec2::new(x, y);
+            if at.cmplt(self.levels[finer].sub_tiles).all() {
+                self.sub_tile(finer, at)?;
+            }
+        }
+        let last = (self.levels[level].width - 1, self.levels[level].height - 1);
+        let reaches = |at: u32, size: usize, last| at as usize * EDGE + size == last as usize + 1;
+        let full = 1 << level;
+        let columns = if reaches(at.x, width, last.0) {
+            covered(last.0, level, self.image.width)
+        } else {
+            full
+        };
+        let rows = if reaches(at.y, height, last.1) {
+            covered(last.1, level, self.image.height)
+        } else {
+            full
+        };
+        means(
+            &self.sums[finer],
+            level,
+            (width, height),
+            (columns, rows),
+            &mut self.voxels,
+        );
+        self.finish(level, at, (width, height))?;
+        let (finer, coarser) = self.sums.split_at_mut(level);
+        halve_sums(&finer[level - 1], &mut coarser[0][quadrant..]);
+        Ok(())
+    }
+
+    /// Pixels of a sub-tile that exist.
+    fn size(&self, level: usize, at: UVec2) -> (usize, usize) {
+        let level = self.levels[level];
+        let size = |at: u32, len: u32| (len - at * SUB_TILE_EDGE).min(SUB_TILE_EDGE) as usize;
+        (size(at.x, level.width), size(at.y, level.height))
+    }
+
+    /// Encodes the sub-tile of a level's pixels.
+    fn encode_part(
+        &mut self,
+        level: usize,
+        at: UVec2,
+        pixels: &[u8],
+        pitch: usize,
+    ) -> Result<(), EncodeError> {
+        let (width, height) = self.size(level, at);
+        let pixels = &pixels[at.y as usize * EDGE * pitch + at.x as usize * EDGE..];
+        if (width, height) == (EDGE, EDGE) {
+            let Some(entry) = entry_of(pixels, pitch, (width, height)) else {
+                self.done[level].push_blank(at);
+                return Ok(());
+            };
+            let to = &mut self.done[level];
+            let begin = to.bytes.len();
+            self.encoder.encode(pixels, pitch, &mut to.bytes)?;
+            to.push(at, begin, entry);
+            return Ok(());
+        }
+        for (to, from) in self
+            .voxels
+            .chunks_exact_mut(EDGE)
+            .zip(pixels.chunks(pitch))
+            .take(height)
+        {
+            to[..width].copy_from_slice(&from[..width]);
+        }
+        self.finish(level, at, (width, height))
+    }
+
+    /// Encodes the sub-tile in `voxels`, of which so many columns and rows exist.
+    fn finish(
+        &mut self,
+        level: usize,
+        at: UVec2,
+        (width, height): (usize, usize),
+    ) -> Result<(), EncodeError> {
+        let to = &mut self.done[level];
+        let Some(entry) = entry_of(&*self.voxels, EDGE, (width, height)) else {
+            to.push_blank(at);
+            return Ok(());
+        };
+        pad(&mut self.voxels, width, height);
+        let begin = to.bytes.len();
+        self.encoder.encode(&*self.voxels, EDGE, &mut to.bytes)?;
+        to.push(at, begin, entry);
+        Ok(())
+    }
+}
+
+/// Repeats the last column and row: the sharp edge of any other padding would ring through JPEG.
+fn pad(voxels: &mut [u8; SUB_TILE_VOXELS], width: usize, height: usize) {
+    for row in voxels.chunks_exact_mut(EDGE).take(height) {
+        let last = row[width - 1];
+        row[width..].fill(last);
+    }
+    let (rows, below) = voxels.split_at_mut(height * EDGE);
+    for row in below.chunks_exact_mut(EDGE) {
+        row.copy_from_slice(&rows[rows.len() - EDGE..]);
+    }
+}
+
+/// The values of `height` rows of `width` pixels; `None` if all are 0. The place is filled in later.
+fn entry_of(pixels: &[u8], pitch: usize, (width, height): (usize, usize)) -> Option<SubTileEntry> {
+    let (mut min, mut max, mut sum) = (u8::MAX, 0, 0);
+    for row in pixels.chunks(pitch).take(height) {
+        let row = &row[..width];
+        min = row.iter().fold(min, |a, &b| a.min(b));
+        max = row.iter().fold(max, |a, &b| a.max(b));
+        sum += row.iter().map(|&v| u32::from(v)).sum::<u32>();
+    }
+    let n = u32::try_from(width * height).expect("no more than a sub-tile");
+    let mean = super::mean::mean(sum, n);
+    (max > 0).then_some(SubTileEntry {
+        offset: 0,
+        len: 0,
+        min,
+        max,
+        mean,
+    })
+}
