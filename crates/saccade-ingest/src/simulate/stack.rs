@@ -1,0 +1,183 @@
+//! Registered stacks: sections that already fit each other, as the simulator's tissue.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DVec3, UVec2, UVec3};
+use saccade_archive::image::{GrayImage, ImageError};
+
+pub mod conformance;
+mod files;
+mod pages;
+mod phantom;
+mod sections;
+
+pub use pages::TiffPages;
+pub use phantom::PhantomStack;
+pub use sections::SectionFolder;
+
+/// What a stack is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StackInfo {
+    /// A name for the volume: letters, digits, `-` and `_`.
+    pub name: String,
+    /// Size \[voxels\]; no axis is 0.
+    pub extent: UVec3,
+    /// Voxel size \[nm\], if the stack says it.
+    pub voxel_nm: Option<DVec3>,
+}
+
+impl StackInfo {
+    /// The voxel size \[nm\], or what is common where the stack does not say: 4 x 4 x 40 nm for a few
+    /// wide sections, as cut with a knife; 8 nm along each axis for a cube, as milled with a beam.
+    pub fn voxel_nm_or_assumed(&self) -> DVec3 {
+        let wide = self.extent.x.max(self.extent.y) > 4 * self.extent.z;
+        let assumed = if wide {
+            DVec3::new(4.0, 4.0, 40.0)
+        } else {
+            DVec3::splat(8.0)
+        };
+        self.voxel_nm.unwrap_or(assumed)
+    }
+}
+
+/// Sections of one size, 8-bit grey.
+///
+/// Every implementation passes [`conformance::check`].
+pub trait Stack: Send + Sync {
+    /// What the stack is; never changes.
+    fn info(&self) -> &StackInfo;
+
+    /// The voxels `min .. min + size` of a section, x fastest. May be called from any thread.
+    ///
+    /// # Errors
+    ///
+    /// [`StackError`]; [`StackError::Outside`] for what the stack does not hold.
+    fn region(&self, section: u32, min: UVec2, size: UVec2) -> Result<GrayImage, StackError>;
+}
+
+/// Why a stack, or a section of it, could not be read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StackError {
+    /// A file or folder could not be read.
+    #[error("cannot read; check that it exists and that you may read it: {}", path.display())]
+    Read {
+        /// What the system says.
+        source: std::io::Error,
+        /// File or folder.
+        path: PathBuf,
+    },
+    /// A section is no 8-bit grey image.
+    #[error("a section of the stack is no usable image: {}", path.display())]
+    Image {
+        /// What is wrong, and how to mend it.
+        source: ImageError,
+        /// The section's file.
+        path: PathBuf,
+    },
+    /// A section differs in size from the first.
+    #[error(
+        "a section has {got} pixels, but the first has {want}; a registered stack has sections of \
+         one size, so crop them or take the file away: {}",
+        path.display()
+    )]
+    Size {
+        /// Its size.
+        got: UVec2,
+        /// The size of the first section.
+        want: UVec2,
+        /// The section's file.
+        path: PathBuf,
+    },
+    /// Nothing there that could be a section.
+    #[error("the folder holds no sections; put 8-bit grey PNG or TIFF files into it: {}", path.display())]
+    Empty {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Neither folder nor a known kind of file.
+    #[error(
+        "this is no stack; give a folder of PNG or TIFF sections, a multi-page TIFF or an OME-Zarr: {}",
+        path.display()
+    )]
+    Unknown {
+        /// File or folder.
+        path: PathBuf,
+    },
+    /// More was asked for than there is.
+    #[error("the stack has {extent} voxels; section {section} at {min} with {size} is not in it")]
+    Outside {
+        /// What the stack holds \[voxels\].
+        extent: UVec3,
+        /// Section asked for.
+        section: u32,
+        /// Low corner asked for.
+        min: UVec2,
+        /// Size asked for.
+        size: UVec2,
+    },
+}
+
+/// Opens a stack: a folder of sections or a multi-page TIFF.
+///
+/// # Errors
+///
+/// [`StackError`], naming the file and the fix.
+pub fn open(path: &Path) -> Result<Box<dyn Stack>, StackError> {
+    let failed = |source| StackError::Read {
+        source,
+        path: path.to_owned(),
+    };
+    let meta = std::fs::metadata(path).map_err(failed)?;
+    if meta.is_dir() {
+        let sections = files::sections_of(path)?;
+        return match &sections[..] {
+            [] => Err(StackError::Empty {
+                path: path.to_owned(),
+            }),
+            // A single TIFF in a folder is most likely all pages in one file.
+            [only] if files::is_tiff(only) => Ok(Box::new(TiffPages::open(only)?)),
+            _ => Ok(Box::new(SectionFolder::open(path)?)),
+        };
+    }
+    if files::is_tiff(path) {
+        return Ok(Box::new(TiffPages::open(path)?));
+    }
+    Err(StackError::Unknown {
+        path: path.to_owned(),
+    })
+}
+
+/// Refuses what lies outside; implementations call it first.
+fn check_inside(info: &StackInfo, section: u32, min: UVec2, size: UVec2) -> Result<(), StackError> {
+    let extent = info.extent;
+    let inside = section < extent.z
+        && size.min_element() > 0
+        && min.cmplt(extent.truncate()).all()
+        && size.cmple(extent.truncate().saturating_sub(min)).all();
+    if inside {
+        Ok(())
+    } else {
+        Err(StackError::Outside {
+            extent,
+            section,
+            min,
+            size,
+        })
+    }
+}
+
+/// Cuts a region out of a whole section.
+fn cropped(section: &GrayImage, min: UVec2, size: UVec2) -> GrayImage {
+    let width = section.width as usize;
+    let mut voxels = Vec::with_capacity(size.x as usize * size.y as usize);
+    for line in section
+        .voxels
+        .chunks_exact(width)
+        .skip(min.y as usize)
+        .take(size.y as usize)
+    {
+        voxels.extend_from_slice(&line[min.x as usize..][..size.x as usize]);
+    }
+    GrayImage::new(size.x, size.y, voxels)
+}
