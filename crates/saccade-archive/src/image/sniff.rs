@@ -38,9 +38,12 @@ pub(super) fn kind(bytes: &[u8]) -> Result<Kind, ImageError> {
     if let Some((_, kind)) = known.iter().find(|(magic, _)| begin.starts_with(magic)) {
         return Ok(*kind);
     }
-    // Also what a file system shows of space that was set aside but not yet written.
-    let unwritten = begin.iter().all(|&b| b == 0);
-    if unwritten || known.iter().any(|(magic, _)| magic.starts_with(begin)) {
+    // A file system shows zeros for space that was set aside but not yet written.
+    let written = begin.len() - begin.iter().rev().take_while(|&&b| b == 0).count();
+    if known
+        .iter()
+        .any(|(magic, _)| magic.starts_with(&begin[..written]))
+    {
         return Err(incomplete("its beginning has not been written"));
     }
     Err(ImageError::Unsupported {
