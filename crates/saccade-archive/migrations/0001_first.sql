@@ -72,10 +72,13 @@ CREATE TABLE cursors (
 CREATE TABLE waiting (
     volume   INTEGER NOT NULL REFERENCES volumes (id),
     position INTEGER NOT NULL,
+    tile     TEXT NOT NULL,
     record   TEXT NOT NULL,                 -- JSON, as the acquisition archive has it
     reason   TEXT NOT NULL,
     PRIMARY KEY (volume, position)
 ) STRICT, WITHOUT ROWID;
+
+CREATE INDEX waiting_by_tile ON waiting (volume, tile);
 
 -- Pyramids that no tile names any more; deleted once nobody can still be reading them.
 CREATE TABLE retired (

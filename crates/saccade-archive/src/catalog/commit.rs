@@ -106,7 +106,7 @@ impl<'c> Commit<'c> {
             return Ok(TileOutcome::Superseded);
         }
         let early = if existing.is_none() {
-            self.take_early(&tile.name).await?
+            self.early(tile).await?
         } else {
             None
         };
@@ -115,11 +115,7 @@ impl<'c> Commit<'c> {
             (Some(e), _) if e.transform_position > tile.position => {
                 (e.transform, e.transform_position)
             }
-            (None, Some((transform, position)))
-                if place(self.extent, tile.section, tile.size, transform).is_some() =>
-            {
-                (transform, position.max(tile.position))
-            }
+            (None, Some((transform, position))) => (transform, position.max(tile.position)),
             _ => (tile.transform, tile.position),
         };
         let place = self.place(&tile.name, tile.section, tile.size, transform)?;
@@ -273,11 +269,12 @@ impl<'c> Commit<'c> {
     /// What SQLite says.
     pub async fn wait(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
         let record = serde_json::to_string(&waiting.record).expect("a record becomes JSON");
-        let query = "INSERT OR REPLACE INTO waiting (volume, position, record, reason) \
-                     VALUES (?, ?, ?, ?)";
+        let query = "INSERT OR REPLACE INTO waiting (volume, position, tile, record, reason) \
+                     VALUES (?, ?, ?, ?, ?)";
         let query = sqlx::query(query)
             .bind(self.volume)
             .bind(rows::signed(waiting.position))
+            .bind(&waiting.record.tile)
             .bind(record)
             .bind(&waiting.reason);
         query
@@ -463,18 +460,33 @@ impl<'c> Commit<'c> {
         Ok(())
     }
 
-    async fn take_early(
+    /// Takes out the transform that came before a tile's first image, if it still counts.
+    async fn early(
         &mut self,
-        tile: &str,
+        tile: &NewTile,
     ) -> Result<Option<(SectionFromTile, u64)>, CatalogError> {
-        let query = "DELETE FROM early_transforms WHERE volume = ? AND tile = ? \
-                     RETURNING a, b, c, d, tx, ty, position";
-        let query = sqlx::query(query).bind(self.volume).bind(tile);
+        let query = "DELETE FROM early_transforms WHERE volume = ?1 AND tile = ?2 \
+                     RETURNING a, b, c, d, tx, ty, position, EXISTS (SELECT 1 FROM waiting \
+                       WHERE waiting.volume = ?1 AND waiting.tile = ?2 \
+                         AND waiting.position < ?3) AS older_waits";
+        let query = sqlx::query(query).bind(self.volume).bind(&tile.name);
+        let query = query.bind(rows::signed(tile.position));
         let row = query.fetch_optional(&mut *self.transaction).await;
         let Some(row) = row.map_err(|e| self.catalog.failed(e))? else {
             return Ok(None);
         };
-        let decode = || Ok((rows::transform(&row)?, rows::unsigned(&row, "position")?));
-        decode().map(Some).map_err(|e| self.catalog.failed(e))
+        let decode = || {
+            let older_waits: bool = row.try_get("older_waits")?;
+            Ok((
+                rows::transform(&row)?,
+                rows::unsigned(&row, "position")?,
+                older_waits,
+            ))
+        };
+        let (transform, position, older_waits) = decode().map_err(|e| self.catalog.failed(e))?;
+        // It counts for the first image, which may still be waiting and then never comes.
+        let counts = position > tile.position || !older_waits;
+        let inside = place(self.extent, tile.section, tile.size, transform).is_some();
+        Ok((counts && inside).then_some((transform, position)))
     }
 }

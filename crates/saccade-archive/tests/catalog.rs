@@ -1,0 +1,737 @@
+//! What the catalog promises: order, revisions, boxes, all or nothing, several processes.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::time::{Duration, SystemTime};
+
+use glam::{DVec2, DVec3, UVec2, UVec3};
+use proptest::prelude::*;
+use saccade_archive::acquisition::{Cursor, TileRecord};
+use saccade_archive::catalog::{
+    CHANGES_AT_ONCE, Catalog, CatalogChange, CatalogError, ChangeReason, Commit, NewTile,
+    Quarantined, Statistics, TileOutcome, TransformOutcome, Waiting, place,
+};
+use saccade_archive::{ArchiveError, VisualizationArchive};
+use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::Volume;
+
+const EXTENT: UVec3 = UVec3::new(100, 80, 6);
+const SIZE: UVec2 = UVec2::new(20, 10);
+
+fn volume(name: &str) -> Volume {
+    Volume::new(name, EXTENT, DVec3::new(4.0, 4.0, 40.0)).unwrap()
+}
+
+fn at(x: f64, y: f64) -> SectionFromTile {
+    SectionFromTile::translation(DVec2::new(x, y))
+}
+
+fn tile(name: &str, section: u32, transform: SectionFromTile, position: u64) -> NewTile {
+    NewTile {
+        name: name.to_owned(),
+        section,
+        size: SIZE,
+        transform,
+        pyramid: format!("tiles/{name}.{position}.tif"),
+        position,
+    }
+}
+
+async fn catalog(folder: &Path) -> Catalog {
+    let catalog = Catalog::create(&folder.join("catalog.sqlite"))
+        .await
+        .unwrap();
+    catalog.create_volume(&volume("v")).await.unwrap();
+    catalog
+}
+
+async fn all_changes(catalog: &Catalog) -> Vec<CatalogChange> {
+    let mut all = Vec::new();
+    loop {
+        let after = all.last().map_or(0, |c: &CatalogChange| c.revision);
+        let next = catalog.changes_after("v", after).await.unwrap();
+        if next.is_empty() {
+            return all;
+        }
+        all.extend(next);
+    }
+}
+
+/// Section, transform and pyramid of each tile, by name.
+type Tiles = BTreeMap<String, (u32, [f64; 6], String)>;
+
+/// Everything a reader sees of the tiles, without what depends on the way they came.
+async fn tiles(catalog: &Catalog) -> Tiles {
+    let mut all = Tiles::new();
+    for z in catalog.sections("v").await.unwrap() {
+        for t in catalog.section_tiles("v", z).await.unwrap() {
+            assert_eq!((t.section, t.size), (z, SIZE));
+            all.insert(t.name, (t.section, t.transform.elements(), t.pyramid));
+        }
+    }
+    all
+}
+
+#[tokio::test]
+async fn a_tile_is_what_was_entered() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    let turned = SectionFromTile::rotated(SIZE.as_dvec2(), 0.1, DVec2::new(3.0, 4.5));
+    assert_eq!(
+        catalog
+            .commit_tile("v", &tile("a", 2, turned, 0))
+            .await
+            .unwrap(),
+        TileOutcome::New
+    );
+    let seen = catalog.section_tiles("v", 2).await.unwrap();
+    assert_eq!(seen.len(), 1);
+    assert_eq!(
+        (seen[0].name.as_str(), seen[0].size, seen[0].transform),
+        ("a", SIZE, turned)
+    );
+    assert_eq!(
+        (seen[0].pyramid.as_str(), seen[0].revision),
+        ("tiles/a.0.tif", 1)
+    );
+    assert_eq!(
+        catalog.tile("v", "a").await.unwrap().as_ref(),
+        Some(&seen[0])
+    );
+    assert_eq!(catalog.tile("v", "b").await.unwrap(), None);
+    assert_eq!(catalog.section_tiles("v", 1).await.unwrap(), []);
+    assert_eq!(catalog.volume("v").await.unwrap(), volume("v"));
+    let changes = all_changes(&catalog).await;
+    assert_eq!(changes.len(), 1);
+    assert_eq!(changes[0].voxels, place(EXTENT, 2, SIZE, turned).unwrap());
+    assert_eq!(
+        (changes[0].reason, changes[0].tile),
+        (ChangeReason::Tile, seen[0].id)
+    );
+}
+
+#[tokio::test]
+async fn a_moved_tile_changes_its_old_and_its_new_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    catalog
+        .commit_tile("v", &tile("a", 2, at(0.0, 0.0), 0))
+        .await
+        .unwrap();
+    let box_at = |z, x, y| place(EXTENT, z, SIZE, at(x, y)).unwrap();
+
+    // A little: one change around both. Far: one each, and nothing in between.
+    catalog.set_transform("v", "a", at(5.0, 0.0)).await.unwrap();
+    catalog
+        .set_transform("v", "a", at(70.0, 60.0))
+        .await
+        .unwrap();
+    // Imaged again in another section.
+    catalog
+        .commit_tile("v", &tile("a", 4, at(70.0, 60.0), 7))
+        .await
+        .unwrap();
+    let boxes: Vec<_> = all_changes(&catalog)
+        .await
+        .iter()
+        .map(|c| c.voxels)
+        .collect();
+    let want = [
+        box_at(2, 0.0, 0.0),
+        box_at(2, 0.0, 0.0).union(box_at(2, 5.0, 0.0)),
+        box_at(2, 5.0, 0.0),
+        box_at(2, 70.0, 60.0),
+        box_at(2, 70.0, 60.0),
+        box_at(4, 70.0, 60.0),
+    ];
+    assert_eq!(boxes, want);
+    assert_eq!(catalog.revision("v").await.unwrap(), 6);
+    assert_eq!(catalog.changes_after("v", 4).await.unwrap().len(), 2);
+
+    // The same again is no change.
+    let same = catalog
+        .set_transform("v", "a", at(70.0, 60.0))
+        .await
+        .unwrap();
+    assert_eq!(same, TransformOutcome::Unchanged);
+    assert_eq!(catalog.revision("v").await.unwrap(), 6);
+}
+
+#[tokio::test]
+async fn nothing_leaves_the_volume() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    for outside in [
+        tile("a", 6, at(0.0, 0.0), 0),
+        tile("a", 0, at(100.0, 0.0), 0),
+        tile("a", 0, at(-20.0, 0.0), 0),
+        tile("a", 0, at(0.0, 1e30), 0),
+    ] {
+        let refused = catalog.commit_tile("v", &outside).await;
+        assert!(
+            matches!(refused, Err(CatalogError::OutsideVolume { .. })),
+            "{outside:?}"
+        );
+    }
+    // One voxel inside is inside.
+    catalog
+        .commit_tile("v", &tile("a", 5, at(99.0, 79.0), 0))
+        .await
+        .unwrap();
+    let refused = catalog.set_transform("v", "a", at(300.0, 0.0)).await;
+    assert!(matches!(refused, Err(CatalogError::OutsideVolume { .. })));
+    let stayed = catalog.tile("v", "a").await.unwrap().unwrap();
+    assert_eq!((stayed.transform, stayed.revision), (at(99.0, 79.0), 1));
+}
+
+#[tokio::test]
+async fn an_early_transform_waits_for_its_tile() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    let kept = catalog.set_transform("v", "a", at(7.0, 7.0)).await.unwrap();
+    assert_eq!(kept, TransformOutcome::Kept);
+    assert_eq!(catalog.revision("v").await.unwrap(), 0);
+    catalog
+        .commit_tile("v", &tile("a", 0, at(1.0, 1.0), 10))
+        .await
+        .unwrap();
+    assert_eq!(
+        catalog.tile("v", "a").await.unwrap().unwrap().transform,
+        at(7.0, 7.0)
+    );
+    // It counted once: the next image brings its own.
+    catalog
+        .commit_tile("v", &tile("a", 0, at(2.0, 2.0), 20))
+        .await
+        .unwrap();
+    assert_eq!(
+        catalog.tile("v", "a").await.unwrap().unwrap().transform,
+        at(2.0, 2.0)
+    );
+}
+
+#[tokio::test]
+async fn a_replaced_pyramid_is_retired_not_forgotten() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    let begin = SystemTime::now() - Duration::from_secs(1);
+    let later = SystemTime::now() + Duration::from_secs(600);
+    catalog
+        .commit_tile("v", &tile("a", 0, at(0.0, 0.0), 1))
+        .await
+        .unwrap();
+    let again = catalog
+        .commit_tile("v", &tile("a", 0, at(0.0, 0.0), 2))
+        .await
+        .unwrap();
+    assert_eq!(again, TileOutcome::Replaced);
+    let older = catalog
+        .commit_tile("v", &tile("a", 0, at(0.0, 0.0), 1))
+        .await
+        .unwrap();
+    assert_eq!(older, TileOutcome::Superseded);
+    assert_eq!(
+        catalog.tile("v", "a").await.unwrap().unwrap().pyramid,
+        "tiles/a.2.tif"
+    );
+    assert_eq!(catalog.entry("v").await.unwrap().tiles, 1);
+
+    assert_eq!(catalog.retired("v", begin, 9).await.unwrap(), []);
+    let retired = catalog.retired("v", later, 9).await.unwrap();
+    assert_eq!(retired.len(), 1);
+    assert_eq!(retired[0].pyramid, "tiles/a.1.tif");
+    let mut commit = catalog.begin("v").await.unwrap();
+    commit.forget_retired("tiles/a.1.tif").await.unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(catalog.retired("v", later, 9).await.unwrap(), []);
+}
+
+#[tokio::test]
+async fn a_commit_happens_whole_or_not_at_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    let waiting = waiting("w", 1, at(0.0, 0.0), 5);
+    let broken = Quarantined {
+        file: "b.tif".to_owned(),
+        tile: Some("b".to_owned()),
+        reason: "it is damaged".to_owned(),
+        bytes: Some(12),
+        at: SystemTime::UNIX_EPOCH + Duration::from_millis(1_234_567),
+    };
+    let cursor = Cursor {
+        offset: 700,
+        line: 9,
+    };
+    let fill = async || {
+        let mut commit = catalog.begin("v").await.unwrap();
+        commit
+            .tile(&tile("a", 0, at(0.0, 0.0), 1), SystemTime::now())
+            .await
+            .unwrap();
+        commit.cursor(cursor).await.unwrap();
+        commit.wait(&waiting).await.unwrap();
+        commit.quarantine(&broken).await.unwrap();
+        commit
+    };
+    drop(fill().await);
+    assert_eq!(
+        catalog.statistics("v").await.unwrap(),
+        Statistics::default()
+    );
+    assert_eq!(catalog.cursor("v").await.unwrap(), Cursor::default());
+    assert_eq!(fill().await.finish().await.unwrap(), 1);
+    catalog.close().await;
+
+    // Another process, later.
+    let catalog = Catalog::open(catalog.path()).await.unwrap();
+    let want = Statistics {
+        revision: 1,
+        tiles: 1,
+        sections: 1,
+        quarantined: 1,
+        waiting: 1,
+    };
+    assert_eq!(catalog.statistics("v").await.unwrap(), want);
+    assert_eq!(catalog.cursor("v").await.unwrap(), cursor);
+    assert_eq!(catalog.waiting("v").await.unwrap(), [waiting]);
+    assert_eq!(catalog.quarantined("v").await.unwrap(), [broken]);
+
+    // A good record ends the quarantine of its tile, and only of that.
+    catalog
+        .commit_tile("v", &tile("c", 0, at(0.0, 0.0), 2))
+        .await
+        .unwrap();
+    assert_eq!(catalog.quarantined("v").await.unwrap().len(), 1);
+    catalog
+        .commit_tile("v", &tile("b", 0, at(0.0, 0.0), 3))
+        .await
+        .unwrap();
+    assert_eq!(catalog.quarantined("v").await.unwrap(), []);
+}
+
+fn waiting(tile: &str, section: u32, transform: SectionFromTile, position: u64) -> Waiting {
+    let (tile, file) = (tile.to_owned(), format!("{tile}.tif"));
+    let record = TileRecord {
+        tile,
+        file,
+        section,
+        size: SIZE,
+        transform,
+    };
+    Waiting {
+        position,
+        record,
+        reason: "it ends early".to_owned(),
+    }
+}
+
+#[tokio::test]
+async fn sections_are_those_with_tiles() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    assert!(catalog.sections("v").await.unwrap().is_empty());
+    let mut commit = catalog.begin("v").await.unwrap();
+    for (n, z) in (0..).zip([5, 0, 3, 3, 0, 5, 5]) {
+        let new = tile(&n.to_string(), z, at(0.0, 0.0), n);
+        commit.tile(&new, SystemTime::now()).await.unwrap();
+    }
+    commit.finish().await.unwrap();
+    assert_eq!(catalog.sections("v").await.unwrap(), [0, 3, 5]);
+    assert_eq!(catalog.section_tiles("v", 5).await.unwrap().len(), 3);
+}
+
+#[tokio::test]
+async fn long_histories_come_in_pieces_without_gaps() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    let mut commit = catalog.begin("v").await.unwrap();
+    commit
+        .tile(&tile("a", 0, at(0.0, 0.0), 0), SystemTime::now())
+        .await
+        .unwrap();
+    let moves = CHANGES_AT_ONCE as u64 + 10;
+    for n in 0..moves {
+        commit
+            .transform("a", at(1.0 + (n % 2) as f64, 0.0), None)
+            .await
+            .unwrap();
+    }
+    assert_eq!(commit.finish().await.unwrap(), moves + 1);
+    assert_eq!(
+        catalog.changes_after("v", 0).await.unwrap().len(),
+        CHANGES_AT_ONCE
+    );
+    let revisions: Vec<_> = all_changes(&catalog)
+        .await
+        .iter()
+        .map(|c| c.revision)
+        .collect();
+    assert_eq!(revisions, (1..=moves + 1).collect::<Vec<_>>());
+}
+
+#[tokio::test]
+async fn other_processes_commits_are_heard() {
+    let folder = tempfile::tempdir().unwrap();
+    let here = catalog(folder.path()).await;
+    here.create_volume(&volume("other")).await.unwrap();
+    // A second handle shares nothing with the first but the file, like another process.
+    let there = Catalog::open(here.path()).await.unwrap();
+    let mut heard = here.subscribe("v").await.unwrap();
+    let mut own = there.subscribe("v").await.unwrap();
+    let mut other = here.subscribe("other").await.unwrap();
+    assert_eq!(*heard.borrow_and_update(), 0);
+    other.borrow_and_update();
+
+    there
+        .commit_tile("v", &tile("a", 0, at(0.0, 0.0), 0))
+        .await
+        .unwrap();
+    assert_eq!(
+        *own.borrow_and_update(),
+        1,
+        "in its own process, before commit returns"
+    );
+    let hear = heard.wait_for(|revision| *revision == 1);
+    tokio::time::timeout(Duration::from_secs(20), hear)
+        .await
+        .expect("heard in time")
+        .unwrap();
+    assert_eq!(here.section_tiles("v", 0).await.unwrap().len(), 1);
+
+    here.set_transform("v", "a", at(3.0, 0.0)).await.unwrap();
+    let hear = own.wait_for(|revision| *revision == 2);
+    tokio::time::timeout(Duration::from_secs(20), hear)
+        .await
+        .expect("heard in time")
+        .unwrap();
+    assert!(
+        !other.has_changed().unwrap(),
+        "nothing happened to the other volume"
+    );
+
+    let unknown = here.subscribe("none").await;
+    assert!(matches!(unknown, Err(CatalogError::UnknownVolume { .. })));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn several_writers_take_turns() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("catalog.sqlite");
+    // Both make it at once.
+    let (a, b) = tokio::join!(Catalog::create(&path), Catalog::create(&path));
+    let (a, b) = (a.unwrap(), b.unwrap());
+    let v = volume("v");
+    let (one, two) = tokio::join!(a.create_volume(&v), b.create_volume(&v));
+    one.and(two).unwrap();
+    let write = |catalog: Catalog, who: &'static str| {
+        tokio::spawn(async move {
+            for n in 0..12 {
+                let new = tile(&format!("{who}{n}"), n % 6, at(1.0, 1.0), u64::from(n));
+                catalog.commit_tile("v", &new).await.unwrap();
+            }
+        })
+    };
+    let (one, two) = tokio::join!(write(a.clone(), "a"), write(b, "b"));
+    one.and(two).unwrap();
+    assert_eq!(a.entry("v").await.unwrap().tiles, 24);
+    let revisions: Vec<_> = all_changes(&a).await.iter().map(|c| c.revision).collect();
+    assert_eq!(revisions, (1..=24).collect::<Vec<_>>());
+}
+
+#[tokio::test]
+async fn other_sizes_and_unknown_names_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    catalog.create_volume(&volume("v")).await.unwrap();
+    let nm = DVec3::new(4.0, 4.0, 40.0);
+    let larger = Volume::new("v", EXTENT + 1, nm).unwrap();
+    let refused = catalog.create_volume(&larger).await.unwrap_err();
+    assert!(matches!(refused, CatalogError::WrongExtent { .. }));
+    assert!(refused.to_string().starts_with("wrong extent"), "{refused}");
+    let coarser = Volume::new("v", EXTENT, nm * 2.0).unwrap();
+    let refused = catalog.create_volume(&coarser).await;
+    assert!(matches!(refused, Err(CatalogError::WrongVoxelSize { .. })));
+    assert_eq!(
+        catalog.volume("v").await.unwrap(),
+        volume("v"),
+        "left as it was"
+    );
+
+    let unknown = catalog.section_tiles("w", 0).await.unwrap_err();
+    assert!(
+        unknown.to_string().contains("the volumes are: v"),
+        "{unknown}"
+    );
+    let unknown = catalog.set_transform("w", "a", at(0.0, 0.0)).await;
+    assert!(matches!(unknown, Err(CatalogError::UnknownVolume { .. })));
+    for name in ["", ".", "../v", "a/b", "a b", "ä", &"n".repeat(101)] {
+        let refused = catalog.create_volume(&volume(name)).await;
+        assert!(
+            matches!(refused, Err(CatalogError::VolumeName { .. })),
+            "{name:?}"
+        );
+    }
+    let volumes = catalog.volumes().await.unwrap();
+    let names: Vec<_> = volumes.into_iter().map(|e| e.volume.name).collect();
+    assert_eq!(names, ["v"]);
+}
+
+#[tokio::test]
+async fn what_is_no_archive_is_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("catalog.sqlite");
+    let none = VisualizationArchive::open(folder.path()).await;
+    assert!(matches!(none, Err(ArchiveError::NotAnArchive { .. })));
+    assert!(matches!(
+        Catalog::open(&path).await,
+        Err(CatalogError::NotFound { .. })
+    ));
+    assert!(!path.exists());
+
+    std::fs::write(&path, "dear diary").unwrap();
+    let text = VisualizationArchive::open(folder.path()).await;
+    assert!(matches!(
+        text,
+        Err(ArchiveError::Catalog(CatalogError::NotACatalog { .. }))
+    ));
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "dear diary");
+
+    // Somebody else's database.
+    std::fs::remove_file(&path).unwrap();
+    sql(&path, "CREATE TABLE birds (name TEXT)").await;
+    assert!(matches!(
+        Catalog::open(&path).await,
+        Err(CatalogError::NotACatalog { .. })
+    ));
+}
+
+#[tokio::test]
+async fn a_newer_schema_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("catalog.sqlite");
+    Catalog::create(&path).await.unwrap().close().await;
+    Catalog::open(&path).await.unwrap().close().await;
+    let future = "INSERT INTO _sqlx_migrations \
+                  (version, description, success, checksum, execution_time) \
+                  VALUES (4711, 'from the future', true, x'00', 0)";
+    sql(&path, future).await;
+    let refused = Catalog::open(&path).await;
+    assert!(
+        matches!(refused, Err(CatalogError::NewerSchema { found: 4711, .. })),
+        "{refused:?}"
+    );
+}
+
+/// Does something to the file behind the catalog's back.
+async fn sql(path: &Path, statement: &'static str) {
+    use sqlx::Connection;
+    let options = sqlx::sqlite::SqliteConnectOptions::new()
+        .filename(path)
+        .create_if_missing(true);
+    let mut connection = sqlx::SqliteConnection::connect_with(&options)
+        .await
+        .unwrap();
+    sqlx::query(statement)
+        .execute(&mut connection)
+        .await
+        .unwrap();
+    connection.close().await.unwrap();
+}
+
+/// One record of a stream; a tile's file is whole so many records later.
+#[derive(Clone, Debug)]
+enum Said {
+    Tile {
+        name: usize,
+        section: u32,
+        x: i32,
+        y: i32,
+        late: usize,
+    },
+    Move {
+        name: usize,
+        x: i32,
+        y: i32,
+    },
+}
+
+fn said() -> impl Strategy<Value = Said> {
+    let place = || (0..80i32, 0..70i32);
+    prop_oneof![
+        (
+            0..3usize,
+            0..6u32,
+            place(),
+            prop_oneof![Just(0usize), 1..9usize]
+        )
+            .prop_map(|(name, section, (x, y), late)| Said::Tile {
+                name,
+                section,
+                x,
+                y,
+                late
+            }),
+        (0..3usize, place()).prop_map(|(name, (x, y))| Said::Move { name, x, y }),
+    ]
+}
+
+/// Commits one record; a tile that is late is returned instead, after it was told to wait.
+async fn commit_one(
+    commit: &mut Commit<'_>,
+    said: &Said,
+    position: usize,
+    in_time: bool,
+) -> Option<(usize, NewTile)> {
+    let record = position as u64;
+    match *said {
+        Said::Tile {
+            name,
+            section,
+            x,
+            y,
+            late,
+        } => {
+            let (name, transform) = (format!("t{name}"), at(x.into(), y.into()));
+            let new = tile(&name, section, transform, record);
+            if !in_time && late > 0 {
+                commit
+                    .wait(&waiting(&name, section, transform, record))
+                    .await
+                    .unwrap();
+                return Some((position + late, new));
+            }
+            commit.tile(&new, SystemTime::now()).await.unwrap();
+        }
+        Said::Move { name, x, y } => {
+            let transform = at(x.into(), y.into());
+            commit
+                .transform(&format!("t{name}"), transform, Some(record))
+                .await
+                .unwrap();
+        }
+    }
+    None
+}
+
+/// Commits a stream, tiles as late as they say or all in time, in one transaction.
+async fn commit_stream(catalog: &Catalog, stream: &[Said], in_time: bool) -> u64 {
+    let mut commit = catalog.begin("v").await.unwrap();
+    let mut late = Vec::new();
+    for (position, said) in stream.iter().enumerate() {
+        late.extend(commit_one(&mut commit, said, position, in_time).await);
+        let last = position + 1 == stream.len();
+        for (_, new) in late.extract_if(.., |(due, _)| last || *due <= position) {
+            commit.tile(&new, SystemTime::now()).await.unwrap();
+            commit.wait_no_more(new.position).await.unwrap();
+        }
+    }
+    commit.finish().await.unwrap()
+}
+
+/// What the documentation of the catalog says, in the plainest way.
+fn model(stream: &[Said]) -> Tiles {
+    let mut tiles = Tiles::new();
+    let mut early = BTreeMap::new();
+    for (position, said) in stream.iter().enumerate() {
+        match *said {
+            Said::Tile {
+                name,
+                section,
+                x,
+                y,
+                ..
+            } => {
+                let name = format!("t{name}");
+                let pyramid = format!("tiles/{name}.{position}.tif");
+                let first = !tiles.contains_key(&name);
+                let kept = early.remove(&name).filter(|_| first);
+                let transform = kept.unwrap_or([1.0, 0.0, 0.0, 1.0, x.into(), y.into()]);
+                tiles.insert(name, (section, transform, pyramid));
+            }
+            Said::Move { name, x, y } => {
+                let name = format!("t{name}");
+                let transform = [1.0, 0.0, 0.0, 1.0, x.into(), y.into()];
+                match tiles.get_mut(&name) {
+                    Some((_, t, _)) => *t = transform,
+                    None => {
+                        early.insert(name, transform);
+                    }
+                }
+            }
+        }
+    }
+    tiles
+}
+
+/// Which image covers which voxel; coordinates are whole, so this needs no rounding.
+fn covered(tiles: &Tiles) -> BTreeSet<([u32; 3], String)> {
+    let mut voxels = BTreeSet::new();
+    for (section, t, pyramid) in tiles.values() {
+        for y in 0..SIZE.y {
+            for x in 0..SIZE.x {
+                let voxel = [t[4] as u32 + x, t[5] as u32 + y, *section];
+                if voxel[0] < EXTENT.x && voxel[1] < EXTENT.y {
+                    voxels.insert((voxel, format!("{pyramid} at {t:?}")));
+                }
+            }
+        }
+    }
+    voxels
+}
+
+fn block_on<T>(work: impl Future<Output = T>) -> T {
+    tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap()
+        .block_on(work)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..Default::default() })]
+
+    /// Whenever the files get whole, the volume ends up the same, as the records' order says.
+    #[test]
+    fn late_files_change_nothing(stream in proptest::collection::vec(said(), 1..14)) {
+        block_on(async {
+            for in_time in [true, false] {
+                let folder = tempfile::tempdir().unwrap();
+                let catalog = catalog(folder.path()).await;
+                let revision = commit_stream(&catalog, &stream, in_time).await;
+                let seen = tiles(&catalog).await;
+                prop_assert_eq!(&seen, &model(&stream), "in time: {}", in_time);
+                prop_assert_eq!(catalog.entry("v").await.unwrap().tiles, seen.len() as u64);
+                prop_assert_eq!(catalog.waiting("v").await.unwrap(), []);
+                let changes = all_changes(&catalog).await;
+                let revisions: Vec<_> = changes.iter().map(|c| c.revision).collect();
+                prop_assert_eq!(revisions, (1..=revision).collect::<Vec<_>>());
+            }
+            Ok(())
+        })?;
+    }
+
+    /// Whoever draws the boxes of the changes anew sees everything that happened.
+    #[test]
+    fn changes_cover_what_changed(stream in proptest::collection::vec(said(), 1..10)) {
+        block_on(async {
+            let folder = tempfile::tempdir().unwrap();
+            let catalog = catalog(folder.path()).await;
+            let mut before = BTreeSet::new();
+            let mut revision = 0;
+            for (position, said) in stream.iter().enumerate() {
+                let mut commit = catalog.begin("v").await.unwrap();
+                commit_one(&mut commit, said, position, true).await;
+                let next = commit.finish().await.unwrap();
+                let changes = catalog.changes_after("v", revision).await.unwrap();
+                let after = covered(&model(&stream[..=position]));
+                for (voxel, _) in before.symmetric_difference(&after) {
+                    let voxel = UVec3::from_array(*voxel);
+                    let told = changes.iter().any(|c| c.voxels.contains(voxel));
+                    prop_assert!(told, "{} changed unheard by {:?}", voxel, said);
+                }
+                (before, revision) = (after, next);
+            }
+            Ok(())
+        })?;
+    }
+}
