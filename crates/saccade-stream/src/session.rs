@@ -5,6 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
+use glam::UVec2;
 use saccade_core::transfer::{Histogram, TransferFunction};
 use saccade_core::volume::Volume;
 use saccade_render::wgpu::DeviceType;
@@ -117,6 +118,8 @@ pub struct Status {
     pub revision: u64,
     /// From submission of the newest frame known about until it was known.
     pub frame_time: Option<Duration>,
+    /// Size of that frame \[pixels\].
+    pub frame_size: UVec2,
     /// Whether the GPU is gone: a new session on a new device is needed.
     pub lost: bool,
     /// When to call again.
@@ -134,8 +137,8 @@ pub struct Session {
     transfer: TransferFunction,
     transfer_is_automatic: bool,
     frames_in_flight: usize,
-    /// Frames without a report, with the time of their submission.
-    pending: VecDeque<(u64, Duration)>,
+    /// Frames without a report.
+    pending: VecDeque<Submitted>,
     drawn: u64,
     drawn_view: Option<View>,
     /// Whether the picture would differ if drawn again.
@@ -143,6 +146,13 @@ pub struct Session {
     report: Option<FrameReport>,
     revision: u64,
     frame_time: Option<Duration>,
+    frame_size: UVec2,
+}
+
+struct Submitted {
+    frame: u64,
+    at: Duration,
+    size: UVec2,
 }
 
 /// How long until it is worth looking whether the GPU has finished a frame.
@@ -197,6 +207,7 @@ impl Session {
             report: None,
             revision,
             frame_time: None,
+            frame_size: UVec2::ZERO,
         })
     }
 
@@ -272,7 +283,11 @@ impl Session {
         if drew {
             self.drawn = self.renderer.render(view);
             self.drawn_view = Some(*view);
-            self.pending.push_back((self.drawn, now));
+            self.pending.push_back(Submitted {
+                frame: self.drawn,
+                at: now,
+                size: view.size,
+            });
             self.dirty = false;
         }
         self.status(now, drew, cut)
@@ -304,11 +319,9 @@ impl Session {
     }
 
     fn take_report(&mut self, report: FrameReport, now: Duration) {
-        while let Some(&(frame, submitted)) = self.pending.front()
-            && frame <= report.frame
-        {
-            self.frame_time = Some(now.saturating_sub(submitted));
-            self.pending.pop_front();
+        while let Some(known) = self.pending.pop_front_if(|f| f.frame <= report.frame) {
+            self.frame_time = Some(now.saturating_sub(known.at));
+            self.frame_size = known.size;
         }
         self.pull.want(report.frame, &report.misses);
         // Where the tables themselves were missing, or the bias moved, only the next frame can
@@ -366,6 +379,7 @@ impl Session {
             progress,
             revision: self.revision,
             frame_time: self.frame_time,
+            frame_size: self.frame_size,
             lost: self.renderer.gpu().is_lost(),
             again,
         }

@@ -1,1 +1,53 @@
 //! The application: a window on a live volume, native and in the browser.
+//!
+//! The same application runs natively (`run`) and as WebAssembly (`start`). It opens with
+//! the whole volume in view and colours that follow the data, shows what arrives while it arrives,
+//! and always says how true the picture is.
+//!
+//! # Spaces and units
+//!
+//! Pointer movements are points of the user interface, pictures are pixels; both grow to the right
+//! and down. Cameras are physical (nm). Colours the user picks are sRGB, those given to the
+//! renderer linear.
+//!
+//! # Promises
+//!
+//! - Nothing waits for data or for the GPU: reading back is asynchronous, pictures being drawn are
+//!   bounded, and while the hand moves they get smaller on slow machines.
+//! - Where nothing changes, nothing is drawn.
+//! - Without user interface (`ui: false`), the picture equals that of a headless session with the
+//!   same camera, size and transfer function, pixel by pixel.
+//!
+//! # Failure
+//!
+//! A missing GPU or a lost one ends the application with a message that says what to install or
+//! do. Missing data do not: the fidelity line tells.
+//!
+//! # What it does not do
+//!
+//! It talks to a GPU only through `saccade-render`, and fetches nothing but through a
+//! [`VolumeSource`](saccade_source::VolumeSource).
+
+mod acquisition;
+mod app;
+mod facts;
+mod navigate;
+mod options;
+mod page;
+mod panel;
+mod picture;
+mod quality;
+mod setup;
+mod transfer_editor;
+
+#[cfg(not(target_family = "wasm"))]
+mod native;
+#[cfg(target_family = "wasm")]
+mod web;
+
+pub use acquisition::AcquisitionReader;
+pub use options::{BackgroundError, ViewOptions, background_from_text};
+pub use page::{PageError, PageOptions};
+
+#[cfg(not(target_family = "wasm"))]
+pub use native::{SourceSpec, ViewError, run};

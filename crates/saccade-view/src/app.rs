@@ -1,0 +1,322 @@
+//! The application itself: input to camera, camera to picture, picture to screen.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use eframe::egui_wgpu::RenderState;
+use egui::{CentralPanel, Key, Panel, PointerButton, Response, Sense, Ui};
+use glam::{DVec2, dvec2};
+use saccade_core::camera::Camera;
+use saccade_render::View;
+use saccade_source::VolumeSource;
+use saccade_stream::{Again, Session, SessionError, SessionOptions, Status, Wake};
+use web_time::Instant;
+
+use crate::acquisition::{Acquisition, AcquisitionReader};
+use crate::facts::{Facts, PageStatus, line};
+use crate::navigate::{Input, moved};
+use crate::options::ViewOptions;
+use crate::panel::{self, Settings};
+use crate::picture::{Picture, Place};
+use crate::quality::Quality;
+use crate::setup::gpu_of;
+use crate::transfer_editor::TransferEditor;
+
+/// The application.
+pub(crate) struct App {
+    session: Session,
+    state: RenderState,
+    wake: Wake,
+    ui: bool,
+    home: Camera,
+    camera: Camera,
+    settings: Settings,
+    editor: TransferEditor,
+    panel_open: bool,
+    picture: Picture,
+    quality: Quality,
+    acquisition: Acquisition,
+    status: Option<Status>,
+    preview: bool,
+    start: Instant,
+    /// What scripts are told after each frame, as JSON.
+    publish: Box<dyn Fn(String)>,
+    /// What is done once the GPU is gone.
+    lost: Box<dyn Fn()>,
+}
+
+/// What surrounds the application.
+pub(crate) struct Surroundings {
+    /// Given the status as JSON after each frame.
+    pub(crate) publish: Box<dyn Fn(String)>,
+    /// Called when the GPU is gone.
+    pub(crate) lost: Box<dyn Fn()>,
+    /// Where the state of the acquisition is asked for.
+    pub(crate) acquisition: Option<AcquisitionReader>,
+}
+
+/// Why the application cannot start.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum StartError {
+    /// The window draws without a GPU.
+    #[error("the window has no GPU device")]
+    NoDevice,
+    /// The volume cannot be shown.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+}
+
+impl App {
+    pub(crate) fn new(
+        context: &eframe::CreationContext<'_>,
+        source: Arc<dyn VolumeSource>,
+        options: ViewOptions,
+        surroundings: Surroundings,
+    ) -> Result<Self, StartError> {
+        let state = context
+            .wgpu_render_state
+            .clone()
+            .ok_or(StartError::NoDevice)?;
+        context.egui_ctx.set_theme(egui::Theme::Dark);
+        let repaint = context.egui_ctx.clone();
+        let wake: Wake = Arc::new(move || repaint.request_repaint());
+        let gpu = gpu_of(&state);
+        let software = gpu.adapter().device_type == saccade_render::wgpu::DeviceType::Cpu;
+        let session_options = SessionOptions {
+            gpu_bytes: options.gpu_bytes,
+            limits: options.limits,
+            frames_in_flight: if software { 1 } else { 2 },
+            wake: wake.clone(),
+        };
+        let home = Camera::around(source.volume());
+        let mut session = Session::new(&gpu, source, session_options)?;
+        if let Some(transfer) = options.transfer {
+            session.set_transfer_function(transfer);
+        }
+        Ok(Self {
+            session,
+            state,
+            wake,
+            ui: options.ui,
+            home,
+            camera: options.camera.unwrap_or(home),
+            settings: Settings {
+                lod_bias: 0.0,
+                substitute: true,
+                false_colors: false,
+                background: options.background,
+            },
+            editor: TransferEditor::default(),
+            panel_open: true,
+            picture: Picture::default(),
+            quality: Quality::default(),
+            acquisition: Acquisition::new(surroundings.acquisition),
+            status: None,
+            preview: false,
+            start: start(),
+            publish: surroundings.publish,
+            lost: surroundings.lost,
+        })
+    }
+
+    /// The panels around the picture. They show what the last frame told.
+    fn panels(&mut self, ui: &mut Ui) {
+        Panel::bottom("fidelity").show(ui, |ui| {
+            ui.horizontal(|ui| {
+                let arrow = if self.panel_open { "⏵" } else { "⏴" };
+                let side = ui.button(arrow).on_hover_text("Show or hide the panel");
+                self.panel_open ^= side.clicked();
+                if let Some(status) = &self.status {
+                    let acquisition = self.acquisition.status();
+                    let facts = Facts {
+                        status,
+                        preview: self.preview,
+                        acquisition,
+                    };
+                    panel::line(ui, &line(&facts));
+                }
+            });
+        });
+        let mut open = self.panel_open;
+        let side = Panel::right("settings").default_size(270.0).min_size(220.0);
+        let home = side.show_collapsible(ui, &mut open, |ui| {
+            panel::show(ui, &mut self.session, &mut self.editor, &mut self.settings)
+        });
+        self.panel_open = open;
+        if home.is_some_and(|shown| shown.inner) {
+            self.camera = self.home;
+        }
+    }
+
+    /// The picture and what the hand does to it.
+    fn scene(&mut self, ui: &mut Ui) {
+        let place = Place::inside(ui.available_rect_before_wrap(), ui.ctx().pixels_per_point());
+        let response = ui.interact(
+            place.rect,
+            ui.scope_id().with("scene"),
+            Sense::click_and_drag(),
+        );
+        let input = input_on(ui, &response);
+        let height = f64::from(place.rect.height());
+        let camera = moved(self.camera, &input, height, self.home);
+        let moving = camera != self.camera || response.dragged();
+        self.camera = camera;
+        if input.arrows != DVec2::ZERO || input.closer != 0.0 {
+            // Held keys send no events of their own.
+            ui.ctx().request_repaint();
+        }
+
+        let now = self.start.elapsed();
+        let scale = if self.ui {
+            self.quality.scale(now, moving, self.full_frame_time(place))
+        } else {
+            1.0
+        };
+        let view = View {
+            lod_bias: self.settings.lod_bias,
+            substitute: self.settings.substitute,
+            false_colors: self.settings.false_colors,
+            background: self.settings.background,
+            ..View::new(self.camera, place.scaled(scale))
+        };
+        let status = self.session.frame(&view);
+        self.preview = scale < 1.0;
+        self.picture
+            .paint(ui.painter(), place, self.session.renderer(), &self.state);
+        self.publish_status(&status, &view);
+        self.schedule(ui, &status, now);
+        if status.lost && !self.status.as_ref().is_some_and(|before| before.lost) {
+            (self.lost)();
+        }
+        self.status = Some(status);
+    }
+
+    /// Time that a picture of the place's full size takes, as far as known.
+    fn full_frame_time(&self, place: Place) -> Option<Duration> {
+        let status = self.status.as_ref()?;
+        let drawn = status.frame_size.as_dvec2().element_product();
+        let full = place.size.as_dvec2().element_product();
+        Some(
+            status
+                .frame_time?
+                .mul_f64((full / drawn.max(1.0)).clamp(0.0, 1e3)),
+        )
+    }
+
+    fn publish_status(&self, status: &Status, view: &View) {
+        let facts = Facts {
+            status,
+            preview: self.preview,
+            acquisition: self.acquisition.status(),
+        };
+        let volume = &self.session.volume().name;
+        let transfer = self.session.transfer_function();
+        let page = PageStatus::new(&facts, volume, &view.camera, view.size, transfer);
+        match serde_json::to_string(&page) {
+            Ok(json) => (self.publish)(json),
+            Err(error) => log::error!("no status: {error}"),
+        }
+    }
+
+    /// Asks for the next frame where one is needed; without need, nothing is drawn.
+    fn schedule(&mut self, ui: &Ui, status: &Status, now: Duration) {
+        let context = ui.ctx();
+        match status.again {
+            Again::Now => context.request_repaint(),
+            Again::After(time) => context.request_repaint_after(time),
+            Again::WhenWoken => {}
+        }
+        let refine = self.quality.refines_in(now);
+        let ask = self.acquisition.update(status.revision, now, &self.wake);
+        for time in refine.into_iter().chain(ask) {
+            context.request_repaint_after(time);
+        }
+        // The panels were laid out before this frame's news.
+        let news = self.status.as_ref().is_none_or(|before| {
+            before.fidelity != status.fidelity
+                || before.complete != status.complete
+                || before.settled != status.settled
+                || before.progress != status.progress
+                || before.revision != status.revision
+        });
+        if self.ui && news {
+            context.request_repaint();
+        }
+    }
+}
+
+impl eframe::App for App {
+    fn ui(&mut self, ui: &mut Ui, _frame: &mut eframe::Frame) {
+        if self.ui {
+            self.panels(ui);
+        }
+        CentralPanel::no_frame().show(ui, |ui| self.scene(ui));
+    }
+
+    fn clear_color(&self, _visuals: &egui::Visuals) -> [f32; 4] {
+        [0.0, 0.0, 0.0, 1.0]
+    }
+
+    fn persist_egui_memory(&self) -> bool {
+        false
+    }
+}
+
+#[cfg_attr(
+    not(target_family = "wasm"),
+    expect(
+        clippy::disallowed_methods,
+        reason = "natively this is the ban's own replacement"
+    )
+)]
+fn start() -> Instant {
+    Instant::now()
+}
+
+/// What the user did to the picture.
+fn input_on(ui: &Ui, response: &Response) -> Input {
+    let typing = ui.ctx().egui_wants_keyboard_input();
+    let points = |v: egui::Vec2| dvec2(v.x.into(), v.y.into());
+    let delta = points(response.drag_delta());
+    ui.input(|i| {
+        let touch = i
+            .multi_touch()
+            .filter(|_| response.hovered() || response.dragged());
+        let drag = |buttons: &[PointerButton]| {
+            let held = buttons.iter().any(|&button| response.dragged_by(button));
+            if held && touch.is_none() {
+                delta
+            } else {
+                DVec2::ZERO
+            }
+        };
+        let held = |key: Key| f64::from(u8::from(!typing && i.key_down(key)));
+        let pressed = |key: Key| !typing && i.key_pressed(key);
+        let pinch = if response.hovered() {
+            f64::from(i.zoom_delta())
+        } else {
+            1.0
+        };
+        let wheel = if response.hovered() && touch.is_none() {
+            i.smooth_scroll_delta().y
+        } else {
+            0.0
+        };
+        let closer = (held(Key::Plus) + held(Key::Equals)).min(1.0) - held(Key::Minus);
+        Input {
+            primary: drag(&[PointerButton::Primary]),
+            other: drag(&[PointerButton::Secondary, PointerButton::Middle]),
+            fingers: touch.map_or(DVec2::ZERO, |t| points(t.translation_delta)),
+            pinch,
+            wheel: wheel.into(),
+            arrows: dvec2(
+                held(Key::ArrowRight) - held(Key::ArrowLeft),
+                held(Key::ArrowDown) - held(Key::ArrowUp),
+            ),
+            closer,
+            shift: i.modifiers.shift,
+            reset: response.double_clicked() || pressed(Key::F) || pressed(Key::R),
+            seconds: f64::from(i.stable_dt.min(0.1)),
+        }
+    })
+}

@@ -1,0 +1,80 @@
+//! What the application opens with.
+
+use saccade_core::camera::Camera;
+use saccade_core::transfer::{TransferFunction, linear_from_srgb};
+use saccade_stream::policy::Limits;
+
+/// What the application opens with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewOptions {
+    /// From where; the whole volume from a corner otherwise.
+    pub camera: Option<Camera>,
+    /// Colours and opacities; following the data otherwise.
+    pub transfer: Option<TransferFunction>,
+    /// Behind everything, linear RGB in `[0, 1]`.
+    pub background: [f32; 3],
+    /// Whether there is anything but the picture.
+    pub ui: bool,
+    /// Ceiling for GPU memory \[bytes\].
+    pub gpu_bytes: u64,
+    /// Ceiling for chunks in main memory, requests at once and so on.
+    pub limits: Limits,
+}
+
+impl Default for ViewOptions {
+    fn default() -> Self {
+        Self {
+            camera: None,
+            transfer: None,
+            background: [0.0; 3],
+            ui: true,
+            gpu_bytes: 512 << 20,
+            limits: Limits::default(),
+        }
+    }
+}
+
+/// Text that names no colour.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("background {text:?} is not #rrggbb")]
+pub struct BackgroundError {
+    /// As given.
+    pub text: String,
+}
+
+/// Linear RGB from `#rrggbb` in sRGB; the `#` may be missing.
+///
+/// # Errors
+///
+/// [`BackgroundError`] on anything else.
+pub fn background_from_text(text: &str) -> Result<[f32; 3], BackgroundError> {
+    let error = || BackgroundError {
+        text: text.to_owned(),
+    };
+    let digits = text.trim().trim_start_matches('#');
+    if digits.len() != 6 || !digits.bytes().all(|b| b.is_ascii_hexdigit()) {
+        return Err(error());
+    }
+    let mut linear = [0.0; 3];
+    for (part, at) in linear.iter_mut().zip([0, 2, 4]) {
+        let value = u8::from_str_radix(&digits[at..at + 2], 16).map_err(|_| error())?;
+        *part = linear_from_srgb(f32::from(value) / 255.0);
+    }
+    Ok(linear)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn backgrounds_are_hexadecimal_srgb() {
+        assert_eq!(background_from_text("#000000"), Ok([0.0; 3]));
+        assert_eq!(background_from_text("ffFFff"), Ok([1.0; 3]));
+        let [r, g, b] = background_from_text("#808000").unwrap();
+        assert!((r - 0.2159).abs() < 1e-3 && r == g && b == 0.0);
+        for bad in ["", "white", "#fff", "#12345g", "#1234567", "+1+2+3", "日本"] {
+            assert!(background_from_text(bad).is_err(), "{bad:?}");
+        }
+    }
+}

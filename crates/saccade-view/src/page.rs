@@ -1,0 +1,127 @@
+//! The part of a web address after the question mark.
+
+use saccade_core::camera::{Camera, ParseCameraError};
+use saccade_core::transfer::TransferFunction;
+
+use crate::options::{BackgroundError, ViewOptions, background_from_text};
+
+/// What a page's address asks for.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PageOptions {
+    /// Volume to open; the server's first otherwise.
+    pub volume: Option<String>,
+    /// What the application opens with.
+    pub view: ViewOptions,
+}
+
+/// An address that cannot be followed.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PageError {
+    /// `camera=`.
+    #[error(transparent)]
+    Camera(#[from] ParseCameraError),
+    /// `background=`.
+    #[error(transparent)]
+    Background(#[from] BackgroundError),
+    /// `transfer=`.
+    #[error("transfer= is no transfer function as JSON")]
+    Transfer {
+        /// What is wrong with it.
+        #[from]
+        source: serde_json::Error,
+    },
+    /// `ui=`.
+    #[error("ui={value} is neither on nor off")]
+    Ui {
+        /// As given.
+        value: String,
+    },
+}
+
+impl PageOptions {
+    /// From names and values, decoded. Names it does not know are left alone.
+    ///
+    /// # Errors
+    ///
+    /// [`PageError`] names the part that is wrong.
+    pub fn from_pairs(
+        pairs: impl IntoIterator<Item = (String, String)>,
+    ) -> Result<Self, PageError> {
+        let mut page = Self::default();
+        for (name, value) in pairs {
+            match name.as_str() {
+                "volume" => page.volume = Some(value),
+                "camera" => page.view.camera = Some(value.parse::<Camera>()?),
+                "transfer" => {
+                    page.view.transfer = Some(serde_json::from_str::<TransferFunction>(&value)?);
+                }
+                "background" => page.view.background = background_from_text(&value)?,
+                "ui" => page.view.ui = on_or_off(value)?,
+                _ => {}
+            }
+        }
+        Ok(page)
+    }
+}
+
+fn on_or_off(value: String) -> Result<bool, PageError> {
+    match value.as_str() {
+        "on" => Ok(true),
+        "off" => Ok(false),
+        _ => Err(PageError::Ui { value }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use saccade_core::transfer::Histogram;
+
+    use super::*;
+
+    fn page(pairs: &[(&str, &str)]) -> Result<PageOptions, PageError> {
+        PageOptions::from_pairs(pairs.iter().map(|&(n, v)| (n.to_owned(), v.to_owned())))
+    }
+
+    #[test]
+    fn an_address_without_wishes_gives_the_defaults() {
+        assert_eq!(page(&[]).unwrap(), PageOptions::default());
+        assert_eq!(
+            page(&[("utm_source", "x")]).unwrap(),
+            PageOptions::default()
+        );
+    }
+
+    #[test]
+    fn every_wish_is_heard() {
+        let size = glam::DVec3::splat(1000.0);
+        let transfer = Histogram::default().transfer_function(size);
+        let json = serde_json::to_string(&transfer).unwrap();
+        let page = page(&[
+            ("volume", "my brain"),
+            ("camera", "30,25,1000,1,2,3"),
+            ("transfer", &json),
+            ("background", "#ffffff"),
+            ("ui", "off"),
+        ]);
+        let PageOptions { volume, view } = page.unwrap();
+        assert_eq!(volume.as_deref(), Some("my brain"));
+        assert_eq!(view.camera.unwrap().distance_nm, 1000.0);
+        assert_eq!(view.transfer, Some(transfer));
+        assert_eq!(view.background, [1.0; 3]);
+        assert!(!view.ui);
+    }
+
+    #[test]
+    fn nonsense_is_named() {
+        for (name, value) in [
+            ("camera", "1,2"),
+            ("transfer", "{}"),
+            ("background", "sky"),
+            ("ui", "maybe"),
+        ] {
+            let error = page(&[(name, value)]).unwrap_err().to_string();
+            assert!(error.contains(name), "{error}");
+        }
+    }
+}

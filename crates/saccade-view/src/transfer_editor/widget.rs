@@ -1,0 +1,151 @@
+//! The plot: histogram behind, colours below, corners to hold.
+
+use egui::{Color32, Mesh, Pos2, Rect, Sense, Shape, Stroke, Ui, pos2, vec2};
+use saccade_core::transfer::{Histogram, TransferFunction};
+
+use super::{PlotPoint, TransferEditor, add, bars, near, remove};
+
+const HEIGHT: f32 = 140.0;
+const RAMP: f32 = 12.0;
+const CORNER: f32 = 5.0;
+/// How far from a corner the hand still takes it \[points\].
+const REACH: f32 = 12.0;
+
+/// Shows the plot and applies what the user does to it. Whether `transfer` changed.
+pub(crate) fn show(
+    ui: &mut Ui,
+    editor: &mut TransferEditor,
+    transfer: &mut TransferFunction,
+    histogram: &Histogram,
+) -> bool {
+    let size = vec2(ui.available_width(), HEIGHT + RAMP);
+    let (whole, response) = ui.allocate_exact_size(size, Sense::click_and_drag());
+    let response = response.on_hover_text(
+        "Drag a corner to change opacity. Double-click adds one, right-click removes it.",
+    );
+    let plot = Rect::from_min_size(whole.min, vec2(whole.width(), HEIGHT));
+    let reach = PlotPoint {
+        value: REACH / plot.width(),
+        opacity: REACH / plot.height(),
+    };
+
+    let mut changed = false;
+    if let Some(pointer) = response
+        .interact_pointer_pos()
+        .map(|p| plot_from_screen(plot, p))
+    {
+        if response.double_clicked() {
+            changed |= near(transfer, pointer, reach).is_none() && add(transfer, pointer);
+        } else if response.secondary_clicked() {
+            let corner = near(transfer, pointer, reach);
+            changed |= corner.is_some_and(|corner| remove(transfer, corner));
+        } else if response.drag_started_by(egui::PointerButton::Primary) {
+            // Where the button went down, not where the drag was noticed.
+            let from = ui.input(|i| i.pointer.press_origin());
+            let from = from.map_or(pointer, |p| plot_from_screen(plot, p));
+            editor.grab(transfer, from, reach);
+        }
+        if response.dragged_by(egui::PointerButton::Primary) {
+            changed |= editor.drag(transfer, pointer);
+        }
+    }
+    if response.drag_stopped() {
+        editor.release();
+    }
+    let hovered = response.hover_pos().map(|p| plot_from_screen(plot, p));
+    let hovered = hovered.and_then(|p| near(transfer, p, reach));
+    paint(
+        ui,
+        whole,
+        plot,
+        transfer,
+        histogram,
+        editor.held().or(hovered),
+    );
+    changed
+}
+
+fn plot_from_screen(plot: Rect, at: Pos2) -> PlotPoint {
+    let within = (at - plot.min) / plot.size();
+    PlotPoint {
+        value: within.x,
+        opacity: 1.0 - within.y,
+    }
+}
+
+fn screen_from_plot(plot: Rect, value: f32, opacity: f32) -> Pos2 {
+    plot.min + vec2(value, 1.0 - opacity) * plot.size()
+}
+
+fn paint(
+    ui: &Ui,
+    whole: Rect,
+    plot: Rect,
+    transfer: &TransferFunction,
+    histogram: &Histogram,
+    active: Option<usize>,
+) {
+    let painter = ui.painter_at(whole.expand(CORNER + 2.0));
+    let visuals = ui.visuals();
+    painter.rect_filled(whole, 2.0, visuals.extreme_bg_color);
+
+    let bar = plot.width() / 256.0;
+    let faint = visuals.weak_text_color().gamma_multiply(0.5);
+    for (value, height) in (0_u8..).zip(bars(histogram.counts())) {
+        if height > 0.0 {
+            let top = screen_from_plot(plot, f32::from(value) / 256.0, height);
+            let rect = Rect::from_min_max(top, pos2(top.x + bar, plot.max.y));
+            painter.rect_filled(rect, 0.0, faint);
+        }
+    }
+
+    painter.add(ramp(
+        Rect::from_min_max(pos2(whole.min.x, plot.max.y), whole.max),
+        transfer,
+    ));
+    for end in transfer.window {
+        let x = screen_from_plot(plot, end.clamp(0.0, 1.0), 0.0).x;
+        painter.vline(
+            x,
+            plot.y_range(),
+            Stroke::new(1.0, visuals.weak_text_color()),
+        );
+    }
+
+    let line: Vec<Pos2> = std::iter::once((0.0, transfer.opacity_at(0.0)))
+        .chain(transfer.opacity.iter().map(|p| (p.value, p.opacity)))
+        .chain(std::iter::once((1.0, transfer.opacity_at(1.0))))
+        .map(|(value, opacity)| screen_from_plot(plot, value, opacity))
+        .collect();
+    let colour = visuals.strong_text_color();
+    painter.line(line, Stroke::new(1.5, colour));
+    for (i, corner) in transfer.opacity.iter().enumerate() {
+        let at = screen_from_plot(plot, corner.value, corner.opacity);
+        let fill = if active == Some(i) {
+            colour
+        } else {
+            visuals.extreme_bg_color
+        };
+        painter.circle(at, CORNER, fill, Stroke::new(1.5, colour));
+    }
+}
+
+/// The colours that values get.
+fn ramp(rect: Rect, transfer: &TransferFunction) -> Shape {
+    let mut mesh = Mesh::default();
+    let steps = 64_u8;
+    for step in 0..=steps {
+        let value = f32::from(step) / f32::from(steps);
+        let [r, g, b] = transfer.color_at(value);
+        let colour: Color32 = egui::Rgba::from_rgb(r, g, b).into();
+        let x = rect.min.x + value * rect.width();
+        mesh.colored_vertex(pos2(x, rect.min.y), colour);
+        mesh.colored_vertex(pos2(x, rect.max.y), colour);
+        if step > 0 {
+            let first = u32::from(step) * 2 - 2;
+            mesh.add_triangle(first, first + 1, first + 2);
+            mesh.add_triangle(first + 1, first + 2, first + 3);
+        }
+    }
+    Shape::mesh(mesh)
+}
