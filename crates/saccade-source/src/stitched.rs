@@ -1,1 +1,231 @@
-//! To be filled.
+//! Voxels stitched from tiles when they are asked for \[000 §5\].
+//!
+//! Nothing is computed before somebody asks. A request for a chunk builds the block around it
+//! (512 x 512 x 32 voxels of its level), straight from the level of the tiles' pyramids that
+//! matches, and keeps it for its neighbours.
+//!
+//! # What a voxel is
+//!
+//! Its sample sits at its centre, `(v + 0.5) * downsampling`.
+//!
+//! - Along z it takes, of the sections within its extent, the one nearest to its centre that has a
+//!   tile there; of two equally near ones the first.
+//! - A tile is there if the sample lies in the tile's rectangle (low edges included, high ones not)
+//!   and not in a blank sub-tile. Where several are, the one whose centre is nearest wins, then the
+//!   one that changed last, then the one with the larger id.
+//! - The value is interpolated linearly in the pyramid level whose pixels are most like the voxel
+//!   in size, with the tile's edge pixels repeated outward; it is at least 1. Where no tile is: 0.
+//! - Where a voxel is larger than the pixels of a tile's coarsest level, it is the mean of 2 x 2,
+//!   4 x 4, at most 16 x 16 such samples, those that are 0 left out.
+//!
+//! # Changes
+//!
+//! When the catalog tells of a tile that came or moved, all that touches its old and new place is
+//! forgotten, and what is being built there is delivered only to those who asked before.
+//!
+//! # Failure
+//!
+//! A tile that cannot be read fails the chunks it would be seen in, with its file's name; all other
+//! chunks are delivered. The tile is tried again after some seconds.
+
+mod block;
+mod blocks;
+mod build;
+mod coverage;
+mod error;
+mod follow;
+mod index;
+mod resample;
+mod tiles;
+
+use std::sync::Arc;
+
+use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::CatalogError;
+use saccade_core::volume::{Dtype, Volume};
+use saccade_core::voxel_box::VoxelBox;
+use tokio::runtime::Handle;
+use tokio::sync::Semaphore;
+use tokio::task::AbortHandle;
+
+use crate::changes::Changes;
+use crate::maybe_send::{BoxFuture, BoxStream};
+use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource};
+use block::{BlockGrid, CutChunk};
+use blocks::Blocks;
+use build::Builder;
+use tiles::Tiles;
+
+pub use error::StitchError;
+pub use index::SectionIndex;
+
+/// Limits of a [`StitchedSource`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StitchedOptions {
+    /// Memory for finished blocks \[bytes\].
+    pub block_bytes: u64,
+    /// Memory for decoded sub-tiles \[bytes\].
+    pub sub_tile_bytes: u64,
+    /// Memory for the indices of pyramids \[bytes\].
+    pub index_bytes: u64,
+    /// Blocks built at a time.
+    pub builds: usize,
+}
+
+impl Default for StitchedOptions {
+    fn default() -> Self {
+        Self {
+            block_bytes: 512 << 20,
+            sub_tile_bytes: 256 << 20,
+            index_bytes: 64 << 20,
+            builds: std::thread::available_parallelism().map_or(2, usize::from),
+        }
+    }
+}
+
+/// What a [`StitchedSource`] holds and has done.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct StitchedStatistics {
+    /// Blocks built since it was opened.
+    pub blocks_built: u64,
+    /// Voxels of those blocks.
+    pub voxels_built: u64,
+    /// Sub-tiles decoded since it was opened.
+    pub sub_tiles_decoded: u64,
+    /// Memory that finished blocks take \[bytes\].
+    pub block_bytes: u64,
+    /// Tiles in the section indices.
+    pub tiles_indexed: u64,
+    /// Memory that the section indices take \[bytes\].
+    pub section_bytes: u64,
+}
+
+/// A volume of an archive, stitched on demand.
+pub struct StitchedSource {
+    inner: Arc<Inner>,
+    follower: AbortHandle,
+}
+
+struct Inner {
+    volume: Arc<Volume>,
+    grid: BlockGrid,
+    blocks: Blocks,
+    builder: Builder,
+    builds: Arc<Semaphore>,
+    changes: Arc<Changes>,
+    runtime: Handle,
+}
+
+impl Drop for StitchedSource {
+    fn drop(&mut self) {
+        self.follower.abort();
+    }
+}
+
+impl StitchedSource {
+    /// Opens the volume `name` of an archive, and follows its changes from now on. Must be called
+    /// on a Tokio runtime, which does the source's work until it is dropped.
+    ///
+    /// # Errors
+    ///
+    /// [`SourceError::NoVolume`] if the archive has none of that name, [`SourceError::Open`] if its
+    /// catalog cannot be read or the volume is not of one 8-bit channel.
+    pub async fn open(
+        archive: &VisualizationArchive,
+        name: &str,
+        options: StitchedOptions,
+    ) -> Result<Self, SourceError> {
+        let catalog = archive.catalog().clone();
+        let open_error = |error: StitchError| SourceError::Open {
+            source: Arc::new(error),
+            location: catalog.path().display().to_string(),
+        };
+        let failed = |source| open_error(StitchError::Catalog { source });
+        // The watch exists before the revision is read, so that no change falls in between.
+        let news = match catalog.subscribe(name).await {
+            Err(CatalogError::UnknownVolume { .. }) => {
+                let volumes = catalog.volumes().await.map_err(failed)?;
+                let known = volumes.into_iter().map(|v| v.volume.name).collect();
+                let name = name.to_owned();
+                return Err(SourceError::NoVolume { name, known });
+            }
+            news => news.map_err(failed)?,
+        };
+        let entry = catalog.entry(name).await.map_err(failed)?;
+        let volume = Arc::new(entry.volume);
+        if volume.dtype != Dtype::Uint8 || volume.channels.len() != 1 {
+            return Err(open_error(StitchError::Kind));
+        }
+        let tiles = Tiles::new(archive, &volume, &options);
+        tiles.load_acquired().await.map_err(open_error)?;
+        let inner = Arc::new(Inner {
+            grid: BlockGrid::new(&volume),
+            blocks: Blocks::new(options.block_bytes),
+            builder: Builder::new(volume.clone(), tiles),
+            builds: Arc::new(Semaphore::new(options.builds.max(1))),
+            changes: Changes::new(VoxelBox::of_size(volume.extent()), entry.revision),
+            runtime: Handle::current(),
+            volume,
+        });
+        let follow = follow::follow(Arc::downgrade(&inner), catalog, news, entry.revision);
+        let follower = tokio::spawn(follow).abort_handle();
+        Ok(Self { inner, follower })
+    }
+
+    /// What it holds and has done.
+    pub fn statistics(&self) -> StitchedStatistics {
+        let mut statistics = self.inner.builder.statistics();
+        statistics.block_bytes = self.inner.blocks.bytes();
+        statistics
+    }
+}
+
+impl VolumeSource for StitchedSource {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.inner.volume
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        Box::pin(async move {
+            if id.voxels(&self.inner.volume).is_none() {
+                return Err(ChunkError::OutOfRange { id });
+            }
+            let (key, chunk) = self.inner.grid.block_of(id);
+            if !self
+                .inner
+                .builder
+                .may_have_data(self.inner.grid.voxels(key), key.level)
+            {
+                return Ok(Chunk::Empty);
+            }
+            let failed = |source: Arc<StitchError>| ChunkError::Failed {
+                id,
+                transient: source.is_transient(),
+                source,
+            };
+            match self.inner.block(key).await.map_err(failed)?.chunk(chunk) {
+                CutChunk::Empty => Ok(Chunk::Empty),
+                CutChunk::Voxels(bytes, _) => Ok(Chunk::Voxels(bytes.clone())),
+                CutChunk::Failed(error) => Err(failed(error.clone())),
+            }
+        })
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.inner.changes.stream()
+    }
+
+    /// Known of chunks that were built and are still held.
+    fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
+        id.voxels(&self.inner.volume)?;
+        let (key, chunk) = self.inner.grid.block_of(id);
+        match self.inner.blocks.peek(key)?.chunk(chunk) {
+            CutChunk::Voxels(_, range) => Some(*range),
+            CutChunk::Empty | CutChunk::Failed(_) => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,219 @@
+//! Blocks: the boxes that are built at once, and the chunks they are cut into.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use glam::{DVec2, UVec2, UVec3};
+use saccade_core::levels::Level;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use tokio::time::Instant;
+
+use super::coverage::Segment;
+use super::error::StitchError;
+use super::index::IndexedTile;
+use crate::{ChunkId, ValueRange};
+
+/// Voxels of a block, about: whole chunks are taken \[000 §5.2\].
+const BLOCK: UVec3 = UVec3::new(512, 512, 32);
+/// A block with a tile that could not be read is built again after this.
+const TRY_AGAIN: Duration = Duration::from_secs(3);
+
+/// Names a block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) struct BlockKey {
+    pub(super) level: u32,
+    block: UVec3,
+}
+
+/// How a volume is divided into blocks.
+pub(super) struct BlockGrid {
+    volume: Arc<Volume>,
+    /// Chunks of a block.
+    chunks: UVec3,
+}
+
+impl BlockGrid {
+    pub(super) fn new(volume: &Arc<Volume>) -> Self {
+        Self {
+            chunks: (BLOCK / volume.chunk).max(UVec3::ONE),
+            volume: volume.clone(),
+        }
+    }
+
+    pub(super) fn chunk(&self) -> UVec3 {
+        self.volume.chunk
+    }
+
+    /// The block that holds a chunk, and which of its chunks that is.
+    pub(super) fn block_of(&self, id: ChunkId) -> (BlockKey, UVec3) {
+        let key = BlockKey {
+            level: id.level,
+            block: id.chunk / self.chunks,
+        };
+        (key, id.chunk % self.chunks)
+    }
+
+    /// The voxels of a block, cut at the level's end.
+    pub(super) fn voxels(&self, key: BlockKey) -> VoxelBox {
+        let extent = self.volume.levels[key.level as usize].extent;
+        let size = self.chunks * self.volume.chunk;
+        let min = key.block * size;
+        VoxelBox::new(min, min.saturating_add(size).min(extent))
+    }
+
+    /// Whether a block shows level-0 voxels of a box.
+    pub(super) fn touches(&self, key: BlockKey, level0: VoxelBox) -> bool {
+        let level = self.volume.levels[key.level as usize];
+        level.box_from_voxels(level0).intersects(self.voxels(key))
+    }
+}
+
+/// One z of a block.
+pub(super) struct Slice {
+    /// Without padding, x fastest; `None` if there is nothing.
+    pub(super) values: Option<Vec<u8>>,
+    pub(super) failures: Vec<Failure>,
+}
+
+/// A tile that could not be read.
+pub(super) struct Failure {
+    error: Arc<StitchError>,
+    /// Where it would be seen \[voxels of the block\].
+    min: UVec2,
+    max: UVec2,
+}
+
+impl Failure {
+    /// Of all that the bounds of a tile touch.
+    pub(super) fn bounds(
+        error: StitchError,
+        tile: &IndexedTile,
+        level: Level,
+        block: VoxelBox,
+    ) -> Self {
+        let step = level.downsampling.truncate();
+        let low = block.min.truncate().as_dvec2();
+        let voxel = |p: DVec2| (p / step - low).max(DVec2::ZERO);
+        Self {
+            error: Arc::new(error),
+            min: voxel(tile.min).floor().as_uvec2(),
+            max: voxel(tile.max).ceil().as_uvec2(),
+        }
+    }
+
+    /// Of segments of a grid with `by` x `by` samples per voxel.
+    pub(super) fn segments(error: StitchError, segments: &[Segment], by: u32) -> Self {
+        let min = segments.iter().map(|s| UVec2::new(s.start, s.y));
+        let max = segments.iter().map(|s| UVec2::new(s.end, s.y + 1));
+        let none = UVec2::ZERO;
+        Self {
+            error: Arc::new(error),
+            min: min.reduce(UVec2::min).unwrap_or(none) / by,
+            max: (max.reduce(UVec2::max).unwrap_or(none) + (by - 1)) / by,
+        }
+    }
+
+    fn touches(&self, min: UVec2, max: UVec2) -> bool {
+        self.min.cmplt(max).all() && self.max.cmpgt(min).all()
+    }
+}
+
+/// A chunk of a block.
+#[derive(Clone)]
+pub(super) enum CutChunk {
+    Empty,
+    Voxels(Bytes, ValueRange),
+    Failed(Arc<StitchError>),
+}
+
+/// A finished block.
+pub(super) struct Block {
+    /// Chunks per axis; none where all are empty.
+    size: UVec3,
+    chunks: Vec<CutChunk>,
+    /// When to build it again, if a tile could not be read.
+    until: Option<Instant>,
+}
+
+impl Block {
+    /// Cuts what was built of `voxels`.
+    pub(super) fn cut(voxels: VoxelBox, chunk: UVec3, slices: &[Slice]) -> Self {
+        let failed = slices.iter().any(|s| !s.failures.is_empty());
+        let size = (voxels.size() + (chunk - 1)) / chunk;
+        let chunks: Vec<_> = if failed || slices.iter().any(|s| s.values.is_some()) {
+            let all = VoxelBox::of_size(size).iter();
+            all.map(|at| cut(voxels.size(), chunk, at * chunk, slices))
+                .collect()
+        } else {
+            Vec::new()
+        };
+        let empty = chunks.iter().all(|c| matches!(c, CutChunk::Empty));
+        Self {
+            size,
+            chunks: if empty { Vec::new() } else { chunks },
+            until: failed.then(|| Instant::now() + TRY_AGAIN),
+        }
+    }
+
+    /// One of its chunks.
+    pub(super) fn chunk(&self, at: UVec3) -> &CutChunk {
+        let (at, size) = (at.as_usizevec3(), self.size.as_usizevec3());
+        let index = (at.z * size.y + at.y) * size.x + at.x;
+        self.chunks.get(index).unwrap_or(&CutChunk::Empty)
+    }
+
+    /// Whether it should be built again.
+    pub(super) fn is_outdated(&self) -> bool {
+        self.until.is_some_and(|until| until <= Instant::now())
+    }
+
+    /// Memory it takes \[bytes\].
+    pub(super) fn memory(&self) -> u64 {
+        let voxels = self.chunks.iter().map(|chunk| match chunk {
+            CutChunk::Voxels(bytes, _) => bytes.len(),
+            CutChunk::Empty | CutChunk::Failed(_) => 0,
+        });
+        let chunks = self.chunks.len() * size_of::<CutChunk>() + size_of::<Self>() + 64;
+        (voxels.sum::<usize>() + chunks) as u64
+    }
+}
+
+/// The chunk whose first voxel is `min` \[voxels of the block\].
+fn cut(size: UVec3, chunk: UVec3, min: UVec3, slices: &[Slice]) -> CutChunk {
+    let max = (min + chunk).min(size);
+    let own = &slices[min.z as usize..max.z as usize];
+    let failures = own.iter().flat_map(|s| &s.failures);
+    let (low, high) = (min.truncate(), max.truncate());
+    if let Some(failure) = { failures }.find(|f| f.touches(low, high)) {
+        return CutChunk::Failed(failure.error.clone());
+    }
+    let [width, height, depth] = chunk.as_usizevec3().to_array();
+    let mut voxels = vec![0; width * height * depth];
+    let (mut least, mut most) = (u8::MAX, 0);
+    for (slice, to) in own.iter().zip(voxels.chunks_exact_mut(width * height)) {
+        let Some(values) = &slice.values else {
+            continue;
+        };
+        let rows = values.chunks_exact(size.x as usize);
+        let rows = rows.skip(min.y as usize).take((max.y - min.y) as usize);
+        for (row, to) in rows.zip(to.chunks_exact_mut(width)) {
+            let row = &row[min.x as usize..max.x as usize];
+            to[..row.len()].copy_from_slice(row);
+            // 0 becomes the largest for the smallest: it is no value.
+            least = row
+                .iter()
+                .fold(least, |least, v| least.min(v.wrapping_sub(1)));
+            most = row.iter().fold(most, |most, v| most.max(*v));
+        }
+    }
+    if most == 0 {
+        return CutChunk::Empty;
+    }
+    let range = ValueRange {
+        min: u16::from(least) + 1,
+        max: u16::from(most),
+    };
+    CutChunk::Voxels(Bytes::from(voxels), range)
+}

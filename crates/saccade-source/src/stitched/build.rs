@@ -1,0 +1,267 @@
+//! Builds the sections of a block.
+
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use futures::future::join_all;
+use futures::stream::{self, StreamExt, TryStreamExt};
+use glam::{DVec2, UVec2};
+use rayon::prelude::*;
+use saccade_core::levels::Level;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use tokio::sync::oneshot;
+
+use super::StitchedStatistics;
+use super::block::{Block, BlockGrid, Failure, Slice};
+use super::coverage::{Candidate, Grid, Segment, Uncovered};
+use super::error::StitchError;
+use super::index::{IndexedTile, SectionIndex};
+use super::resample::{Patch, averaged};
+use super::tiles::{Fetched, Tiles};
+
+/// Samples per axis that a voxel larger than any pixel is the mean of, at most: 2^4.
+const FINEST_SAMPLING: u32 = 4;
+/// Sections of a block on which work is under way.
+const SECTIONS_AT_ONCE: usize = 4;
+
+pub(super) struct Builder {
+    volume: Arc<Volume>,
+    tiles: Arc<Tiles>,
+    blocks: AtomicU64,
+    voxels: AtomicU64,
+}
+
+/// What one tile gives to a section of a block.
+struct Part {
+    candidate: Candidate,
+    segments: Vec<Segment>,
+}
+
+impl Builder {
+    pub(super) fn new(volume: Arc<Volume>, tiles: Tiles) -> Self {
+        Self {
+            volume,
+            tiles: Arc::new(tiles),
+            blocks: AtomicU64::new(0),
+            voxels: AtomicU64::new(0),
+        }
+    }
+
+    pub(super) fn tiles(&self) -> &Tiles {
+        &self.tiles
+    }
+
+    pub(super) fn statistics(&self) -> StitchedStatistics {
+        let (tiles_indexed, section_bytes) = self.tiles.indexed();
+        StitchedStatistics {
+            blocks_built: self.blocks.load(Ordering::Relaxed),
+            voxels_built: self.voxels.load(Ordering::Relaxed),
+            sub_tiles_decoded: self.tiles.decoded(),
+            tiles_indexed,
+            section_bytes,
+            ..StitchedStatistics::default()
+        }
+    }
+
+    /// Whether a box of a level's voxels touches a section that has a tile.
+    pub(super) fn may_have_data(&self, voxels: VoxelBox, level: u32) -> bool {
+        let level0 = self.volume.levels[level as usize].voxels_from_box(voxels);
+        self.tiles.any_acquired(level0.min.z..level0.max.z)
+    }
+
+    /// Builds the block of these voxels.
+    pub(super) async fn block(
+        &self,
+        grid: &BlockGrid,
+        voxels: VoxelBox,
+        level: u32,
+    ) -> Result<Block, StitchError> {
+        let level = self.volume.levels[level as usize];
+        let slices = (voxels.min.z..voxels.max.z).map(|z| self.slice(level, voxels, z));
+        let slices = stream::iter(slices).buffered(SECTIONS_AT_ONCE);
+        let slices: Vec<_> = slices.try_collect().await?;
+        self.blocks.fetch_add(1, Ordering::Relaxed);
+        self.voxels.fetch_add(voxels.voxels(), Ordering::Relaxed);
+        let chunk = grid.chunk();
+        Ok(on_rayon(move || Block::cut(voxels, chunk, &slices)).await)
+    }
+
+    /// Stitches one z of a block.
+    async fn slice(&self, level: Level, voxels: VoxelBox, z: u32) -> Result<Slice, StitchError> {
+        let size = voxels.size().truncate();
+        let step = level.downsampling.truncate();
+        let mut planned: Option<(Grid, Uncovered)> = None;
+        let mut parts = Vec::new();
+        let mut failures = Vec::new();
+        let whole = Grid {
+            first: voxels.min.truncate(),
+            size,
+            step,
+        };
+        let (min, max) = whole.bounds();
+        for section in self.sections_of(level, z) {
+            let index = self.tiles.section(section).await?;
+            let near = near(&index, min, max);
+            if near.is_empty() {
+                continue;
+            }
+            let (grid, uncovered) = planned.take().unwrap_or_else(|| {
+                let by = 1 << sampling(&near, step);
+                let (first, size) = (whole.first * by, whole.size * by);
+                let step = step / f64::from(by);
+                let grid = Grid { first, size, step };
+                (grid, Uncovered::all(&grid))
+            });
+            let opened = join_all(near.iter().map(|tile| self.tiles.pyramid(tile))).await;
+            let mut candidates = Vec::new();
+            for (tile, pyramid) in near.into_iter().zip(opened) {
+                match pyramid {
+                    Ok(pyramid) => candidates.push(Candidate::new(tile, pyramid, &grid)),
+                    Err(error) => failures.push(Failure::bounds(error, &tile, level, voxels)),
+                }
+            }
+            let covered = on_rayon(move || cover(&grid, uncovered, candidates)).await;
+            let (uncovered, new_parts) = covered;
+            parts.extend(new_parts);
+            if uncovered.is_empty() {
+                planned = Some((grid, uncovered));
+                break;
+            }
+            planned = Some((grid, uncovered));
+        }
+        let Some((grid, _)) = planned.filter(|_| !parts.is_empty()) else {
+            return Ok(Slice {
+                values: None,
+                failures,
+            });
+        };
+        let fetched = parts.into_iter().map(async |part: Part| {
+            let Candidate {
+                tile,
+                pyramid,
+                level,
+                ..
+            } = &part.candidate;
+            let wanted = part.candidate.sub_tiles(&grid, &part.segments);
+            let fetched = self
+                .tiles
+                .fetch(pyramid, tile.section, *level, wanted)
+                .await;
+            (part, fetched)
+        });
+        let fetched = join_all(fetched).await;
+        let tiles = self.tiles.clone();
+        let sampled = on_rayon(move || {
+            let by = grid.size.x / size.x;
+            let mut values = vec![0; grid.size.as_usizevec2().element_product()];
+            for (part, fetched) in fetched {
+                let drawn = fetched.and_then(|f| draw(&tiles, &grid, &part, f, &mut values));
+                if let Err(error) = drawn {
+                    failures.push(Failure::segments(error, &part.segments, by));
+                }
+            }
+            let values = if by > 1 {
+                averaged(&values, size, by)
+            } else {
+                values
+            };
+            Slice {
+                values: Some(values),
+                failures,
+            }
+        });
+        Ok(sampled.await)
+    }
+
+    /// The sections with a tile that voxel `z` of a level spans, the one nearest its centre first.
+    fn sections_of(&self, level: Level, z: u32) -> Vec<u32> {
+        let span = level.downsampling.z;
+        let z = f64::from(z);
+        // Those whose middle lies within the voxel.
+        let first = |z: f64| DVec2::splat((z * span - 0.5).ceil().max(0.0)).as_uvec2().x;
+        let mut sections = self.tiles.acquired(first(z)..first(z + 1.0));
+        let centre = (z + 0.5) * span;
+        let distance = |section: &u32| (f64::from(*section) + 0.5 - centre).abs();
+        // Stable: of two equally near ones, the first.
+        sections.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
+        sections
+    }
+}
+
+fn near(index: &SectionIndex, min: DVec2, max: DVec2) -> Vec<IndexedTile> {
+    index.touching(min, max).into_iter().cloned().collect()
+}
+
+/// How many times the voxels of `step` level-0 voxels must be halved to be like a pixel of the
+/// coarsest level of every tile.
+fn sampling(tiles: &[IndexedTile], step: DVec2) -> u32 {
+    let each = tiles.iter().map(|tile| {
+        let coarser = tile
+            .wanted_level(step)
+            .saturating_sub(tile.coarsest_level());
+        coarser.min(FINEST_SAMPLING)
+    });
+    each.max().unwrap_or(0)
+}
+
+fn cover(
+    grid: &Grid,
+    mut uncovered: Uncovered,
+    candidates: Vec<Candidate>,
+) -> (Uncovered, Vec<Part>) {
+    let segments = uncovered.cover(grid, &candidates);
+    let parts = candidates.into_iter().zip(segments);
+    let parts = parts.filter(|(_, segments)| !segments.is_empty());
+    let parts = parts.map(|(candidate, segments)| Part {
+        candidate,
+        segments,
+    });
+    (uncovered, parts.collect())
+}
+
+/// Decodes what a tile gives and draws it.
+fn draw(
+    tiles: &Tiles,
+    grid: &Grid,
+    part: &Part,
+    fetched: Vec<(UVec2, Fetched)>,
+    values: &mut [u8],
+) -> Result<(), StitchError> {
+    let candidate = &part.candidate;
+    let decode = |(at, fetched)| {
+        let (section, level) = (candidate.tile.section, candidate.level);
+        let voxels = tiles.decode(&candidate.pyramid, section, level, at, fetched)?;
+        Ok((at, voxels))
+    };
+    let decoded: Result<Vec<_>, StitchError> = fetched.into_par_iter().map(decode).collect();
+    let patch = Patch::new(candidate.size(), &decoded?);
+    let along = candidate.pixels_along_x(grid);
+    for segment in &part.segments {
+        let row = segment.y as usize * grid.size.x as usize;
+        let out = &mut values[row + segment.start as usize..row + segment.end as usize];
+        let pixel = candidate.pixel(grid, segment.start, segment.y);
+        patch.sample(pixel, along, out);
+    }
+    Ok(())
+}
+
+/// Runs on rayon's threads, unless nobody waits for it any more.
+async fn on_rayon<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    let (send, receive) = oneshot::channel();
+    rayon::spawn(move || {
+        if !send.is_closed() {
+            // A panic is a bug; it goes to whoever waits, instead of ending the process.
+            let done = catch_unwind(AssertUnwindSafe(work));
+            let _ = send.send(done);
+        }
+    });
+    match receive
+        .await
+        .expect("the sender sends while the receiver is there")
+    {
+        Ok(done) => done,
+        Err(panic) => resume_unwind(panic),
+    }
+}

@@ -1,0 +1,334 @@
+//! Which tile each sample takes: geometry alone, before any pixel is read.
+
+use std::cmp::Ordering;
+use std::ops::Range;
+use std::sync::Arc;
+
+use glam::{DVec2, UVec2};
+use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE};
+
+use super::index::IndexedTile;
+use super::tiles::Pyramid;
+
+/// Samples on a section, `size` of them, of which the first is number `first` of the whole level.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Grid {
+    pub(super) first: UVec2,
+    pub(super) size: UVec2,
+    /// Between samples \[level-0 voxels\].
+    pub(super) step: DVec2,
+}
+
+impl Grid {
+    /// Where sample (x, y) sits \[level-0 voxels\].
+    pub(super) fn point(&self, x: u32, y: u32) -> DVec2 {
+        ((self.first.as_dvec2() + DVec2::new(f64::from(x), f64::from(y))) + 0.5) * self.step
+    }
+
+    /// Corners of all samples \[level-0 voxels\].
+    pub(super) fn bounds(&self) -> (DVec2, DVec2) {
+        let end = self.first.as_dvec2() + self.size.as_dvec2();
+        (self.first.as_dvec2() * self.step, end * self.step)
+    }
+}
+
+/// Samples of a row that take their values from one tile.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Segment {
+    pub(super) y: u32,
+    pub(super) start: u32,
+    pub(super) end: u32,
+}
+
+/// A tile that may be seen.
+#[derive(Clone)]
+pub(super) struct Candidate {
+    pub(super) tile: IndexedTile,
+    pub(super) pyramid: Arc<Pyramid>,
+    /// The level of the pyramid that suits the grid.
+    pub(super) level: u32,
+}
+
+impl Candidate {
+    pub(super) fn new(tile: IndexedTile, pyramid: Arc<Pyramid>, grid: &Grid) -> Self {
+        let level = tile.wanted_level(grid.step).min(tile.coarsest_level());
+        Self {
+            tile,
+            pyramid,
+            level,
+        }
+    }
+
+    pub(super) fn size(&self) -> PyramidLevel {
+        self.pyramid.index.levels()[self.level as usize]
+    }
+
+    /// Position \[pixels of the level\] of a sample; pixel `i` covers `[i, i + 1)`.
+    pub(super) fn pixel(&self, grid: &Grid, x: u32, y: u32) -> DVec2 {
+        self.tile.position(grid.point(x, y)) / f64::from(1_u32 << self.level)
+    }
+
+    /// How far that position moves from one sample to the next.
+    pub(super) fn pixels_along_x(&self, grid: &Grid) -> DVec2 {
+        self.tile.tile_from_section.along_x() * grid.step.x / f64::from(1_u32 << self.level)
+    }
+
+    /// The samples of a row that lie in the tile's rectangle.
+    fn row(&self, grid: &Grid, y: u32) -> Range<u32> {
+        let inside = |x| self.tile.contains(self.tile.position(grid.point(x, y)));
+        let first = self.tile.position(grid.point(0, y));
+        let along = self.tile.tile_from_section.along_x() * grid.step.x;
+        let size = self.tile.size.as_dvec2();
+        let width = f64::from(grid.size.x);
+        let (mut low, mut high) = (0.0_f64, width);
+        for (first, along, size) in [(first.x, along.x, size.x), (first.y, along.y, size.y)] {
+            // A row that runs along an edge is judged sample by sample at its ends, below.
+            if along.abs() * width > 1e-9 {
+                let (a, b) = (-first / along, (size - first) / along);
+                (low, high) = (low.max(a.min(b)), high.min(a.max(b)));
+            }
+        }
+        if high < low - 1.0 {
+            return 0..0;
+        }
+        // Rounding may have moved the ends by a sample: the samples themselves decide.
+        let whole = |v: f64| DVec2::splat(v.clamp(0.0, width)).as_uvec2().x;
+        let (mut start, mut end) = (whole(low.floor() - 1.0), whole(high.ceil() + 1.0));
+        while start < end && !inside(start) {
+            start += 1;
+        }
+        while end > start && !inside(end - 1) {
+            end -= 1;
+        }
+        start..end
+    }
+
+    /// Cuts a row where the tile's pixels are in blank sub-tiles; calls `keep` with the rest.
+    fn without_blanks(
+        &self,
+        grid: &Grid,
+        y: u32,
+        row: Range<u32>,
+        mut keep: impl FnMut(Range<u32>),
+    ) {
+        if !self.pyramid.has_blanks(self.level) {
+            return keep(row);
+        }
+        let mut start = None;
+        for x in row.clone() {
+            let seen = !self.pyramid.is_blank_at(self.level, self.pixel(grid, x, y));
+            match (seen, start) {
+                (true, None) => start = Some(x),
+                (false, Some(first)) => {
+                    keep(first..x);
+                    start = None;
+                }
+                _ => {}
+            }
+        }
+        if let Some(first) = start {
+            keep(first..row.end);
+        }
+    }
+
+    /// `Less` where this tile goes before another at a sample.
+    fn compare(&self, other: &Self, point: DVec2) -> Ordering {
+        let distance = |c: &Self| point.distance_squared(c.tile.centre);
+        let nearer = distance(self).total_cmp(&distance(other));
+        let newer = other.tile.revision.cmp(&self.tile.revision);
+        nearer.then(newer).then(other.tile.id.cmp(&self.tile.id))
+    }
+
+    /// The sub-tiles that the samples of these segments touch.
+    pub(super) fn sub_tiles(&self, grid: &Grid, segments: &[Segment]) -> Vec<UVec2> {
+        const PIECE: u32 = 32;
+        // More than positions are off by in fixed point.
+        const MARGIN: f64 = 1e-3;
+        let size = self.size();
+        let last = DVec2::new(f64::from(size.width - 1), f64::from(size.height - 1));
+        let columns = size.sub_tiles.x;
+        let mut wanted = vec![false; (columns * size.sub_tiles.y) as usize];
+        for segment in segments {
+            let mut start = segment.start;
+            while start < segment.end {
+                let end = (start + PIECE).min(segment.end);
+                let a = self.pixel(grid, start, segment.y);
+                let b = self.pixel(grid, end - 1, segment.y);
+                // Between the centres of two pixels in each direction.
+                let low = (a.min(b) - (0.5 + MARGIN)).floor();
+                let high = (a.max(b) - (0.5 - MARGIN)).floor() + 1.0;
+                let low = low.clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
+                let high = high.clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
+                for y in low.y..=high.y {
+                    for x in low.x..=high.x {
+                        wanted[(y * columns + x) as usize] = true;
+                    }
+                }
+                start = end;
+            }
+        }
+        let wanted = (0..).zip(wanted).filter(|(_, wanted)| *wanted);
+        wanted
+            .map(|(n, _)| UVec2::new(n % columns, n / columns))
+            .collect()
+    }
+}
+
+/// Samples that no tile was found for yet: of each row, what is left.
+pub(super) struct Uncovered {
+    rows: Vec<Vec<Range<u32>>>,
+}
+
+impl Uncovered {
+    pub(super) fn all(grid: &Grid) -> Self {
+        let row = if grid.size.x == 0 {
+            0..0
+        } else {
+            0..grid.size.x
+        };
+        Self {
+            rows: vec![vec![row]; grid.size.y as usize],
+        }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.rows.iter().all(Vec::is_empty)
+    }
+
+    /// Gives what is left to the candidates that cover it; returns each one's segments.
+    pub(super) fn cover(&mut self, grid: &Grid, candidates: &[Candidate]) -> Vec<Vec<Segment>> {
+        let mut segments = vec![Vec::new(); candidates.len()];
+        let mut pieces = Vec::new();
+        let mut ends = Vec::new();
+        for (y, left) in (0..).zip(&mut self.rows) {
+            if left.is_empty() {
+                continue;
+            }
+            pieces.clear();
+            let height = grid.point(0, y).y;
+            for (n, candidate) in candidates.iter().enumerate() {
+                if candidate.tile.min.y <= height && height <= candidate.tile.max.y {
+                    let row = candidate.row(grid, y);
+                    if !row.is_empty() {
+                        candidate.without_blanks(grid, y, row, |piece| pieces.push((n, piece)));
+                    }
+                }
+            }
+            winners(grid, y, candidates, &mut pieces, &mut ends, |n, won| {
+                take(left, won, |part| {
+                    segments[n].push(Segment {
+                        y,
+                        start: part.start,
+                        end: part.end,
+                    });
+                });
+            });
+        }
+        segments
+    }
+}
+
+/// Takes `won` out of the ranges `left`; calls `part` with what was in both.
+fn take(left: &mut Vec<Range<u32>>, won: Range<u32>, mut part: impl FnMut(Range<u32>)) {
+    let mut n = 0;
+    while n < left.len() {
+        let range = left[n].clone();
+        let both = range.start.max(won.start)..range.end.min(won.end);
+        if both.is_empty() {
+            n += 1;
+            continue;
+        }
+        let rests = [range.start..both.start, both.end..range.end];
+        let rests = rests.into_iter().filter(|r| !r.is_empty());
+        let count = rests.clone().count();
+        left.splice(n..=n, rests);
+        n += count;
+        part(both);
+    }
+}
+
+/// Calls `won` with each run of samples and the candidate that is seen there.
+fn winners(
+    grid: &Grid,
+    y: u32,
+    candidates: &[Candidate],
+    pieces: &mut [(usize, Range<u32>)],
+    ends: &mut Vec<u32>,
+    mut won: impl FnMut(usize, Range<u32>),
+) {
+    pieces.sort_unstable_by_key(|(n, piece)| (piece.start, *n));
+    let apart = pieces.windows(2).all(|p| p[0].1.end <= p[1].1.start);
+    if apart {
+        for (n, piece) in pieces {
+            won(*n, piece.clone());
+        }
+        return;
+    }
+    // Between two neighbouring `ends` the same pieces are there, in the same order of preference.
+    ends.clear();
+    for (n, (a, piece)) in pieces.iter().enumerate() {
+        ends.extend([piece.start, piece.end]);
+        let later = pieces[n + 1..].iter();
+        for (b, other) in later.take_while(|(_, other)| other.start < piece.end) {
+            let both = other.start..piece.end.min(other.end);
+            let before = |x| {
+                candidates[*a]
+                    .compare(&candidates[*b], grid.point(x, y))
+                    .is_lt()
+            };
+            // Which of two centres is nearer changes once along a row at most.
+            let at_end = before(both.end - 1);
+            if before(both.start) != at_end {
+                let (mut low, mut high) = (both.start, both.end - 1);
+                while high - low > 1 {
+                    let middle = low.midpoint(high);
+                    if before(middle) == at_end {
+                        high = middle;
+                    } else {
+                        low = middle;
+                    }
+                }
+                ends.push(high);
+            }
+        }
+    }
+    ends.sort_unstable();
+    ends.dedup();
+    for run in ends.windows(2) {
+        let (start, end) = (run[0], run[1]);
+        let here = pieces.iter().filter(|(_, p)| p.contains(&start));
+        let point = grid.point(start, y);
+        let best = here.min_by(|a, b| candidates[a.0].compare(&candidates[b.0], point));
+        if let Some((n, _)) = best {
+            won(*n, start..end);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn taking_leaves_the_rest(
+            taken in prop::collection::vec((0..40_u32, 0..40_u32), 0..8),
+        ) {
+            let mut left = vec![0..40];
+            let mut seen = [false; 40];
+            for (a, b) in taken {
+                let won = a.min(b)..a.max(b);
+                let mut got = [false; 40];
+                take(&mut left, won.clone(), |part| part.for_each(|x| got[x as usize] = true));
+                for x in 0..40 {
+                    let before = seen[x as usize];
+                    prop_assert_eq!(got[x as usize], won.contains(&x) && !before);
+                    seen[x as usize] |= won.contains(&x);
+                    let is_left = left.iter().any(|r| r.contains(&x));
+                    prop_assert_eq!(is_left, !seen[x as usize]);
+                }
+            }
+        }
+    }
+}

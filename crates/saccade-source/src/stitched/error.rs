@@ -1,0 +1,61 @@
+use saccade_archive::catalog::CatalogError;
+use saccade_archive::pyramid::PyramidError;
+
+/// Why a block, or the part of it that a tile covers, could not be built.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum StitchError {
+    /// The catalog could not be read.
+    #[error("the tiles of a section could not be looked up")]
+    Catalog {
+        /// What went wrong.
+        source: CatalogError,
+    },
+    /// A tile's pyramid could not be read.
+    #[error("a tile of section {section} could not be read")]
+    Tile {
+        /// What went wrong, with the file.
+        source: PyramidError,
+        /// Where the tile is seen.
+        section: u32,
+    },
+    /// A tile's pyramid is not of the size that the catalog says.
+    #[error(
+        "the pyramid is of {got} pixels, the catalog says {expected}; ingest the tile again: {name}"
+    )]
+    Size {
+        /// As the catalog says \[pixels\].
+        expected: glam::UVec2,
+        /// Of the pyramid \[pixels\].
+        got: glam::UVec2,
+        /// The file.
+        name: String,
+    },
+    /// A tile's pyramid is shorter than its index says.
+    #[error("the pyramid ends early; delete it and ingest the tile again: {name}")]
+    Cut {
+        /// The file.
+        name: String,
+    },
+    /// Only volumes of one 8-bit channel can be stitched.
+    #[error("only volumes of one 8-bit channel can be stitched")]
+    Kind,
+    /// The runtime that does the work has ended, or building panicked.
+    #[error("building stopped")]
+    Stopped {
+        /// How.
+        source: tokio::task::JoinError,
+    },
+}
+
+impl StitchError {
+    /// Whether the same request may succeed later, without the tile being ingested again.
+    pub fn is_transient(&self) -> bool {
+        match self {
+            Self::Catalog { source } => source.is_transient(),
+            // A file that is not there may be on its way; the catalog named it.
+            Self::Tile { source, .. } => matches!(source, PyramidError::Storage { .. }),
+            Self::Size { .. } | Self::Cut { .. } | Self::Kind | Self::Stopped { .. } => false,
+        }
+    }
+}

@@ -1,0 +1,288 @@
+//! What is known of the tiles: indices of sections and of pyramids, decoded sub-tiles.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use futures::future::try_join_all;
+use glam::{DVec2, UVec2};
+use quick_cache::Weighter;
+use quick_cache::sync::Cache;
+use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::Catalog;
+use saccade_archive::pyramid::{PyramidIndex, SUB_TILE_EDGE, SUB_TILE_VOXELS};
+use saccade_archive::storage::Storage;
+use saccade_core::volume::Volume;
+use tokio::sync::OnceCell;
+
+use super::StitchedOptions;
+use super::error::StitchError;
+use super::index::{IndexedTile, SectionIndex};
+
+/// Bytes that are rather read and thrown away than left out by a further read.
+const GAP: u64 = 16 << 10;
+
+/// An opened pyramid.
+pub(super) struct Pyramid {
+    pub(super) index: PyramidIndex,
+    /// Another each time one is opened.
+    serial: u64,
+    /// Per level, whether a sub-tile is blank.
+    blanks: Vec<bool>,
+}
+
+impl Pyramid {
+    fn new(index: PyramidIndex, serial: u64) -> Self {
+        let levels = index.levels().iter().enumerate();
+        let blanks = levels.map(|(level, size)| {
+            let rows = (0..size.sub_tiles.y).map(|y| (y, 0..size.sub_tiles.x));
+            let mut all = rows.flat_map(|(y, xs)| xs.map(move |x| (x, y)));
+            all.any(|(x, y)| index.sub_tile(level, x, y).is_none_or(|e| e.is_blank()))
+        });
+        let blanks = blanks.collect();
+        Self {
+            index,
+            serial,
+            blanks,
+        }
+    }
+
+    pub(super) fn has_blanks(&self, level: u32) -> bool {
+        self.blanks[level as usize]
+    }
+
+    /// Whether a position \[pixels of the level\] is in a blank sub-tile.
+    pub(super) fn is_blank_at(&self, level: u32, pixel: DVec2) -> bool {
+        let size = self.index.levels()[level as usize];
+        let last = UVec2::new(size.width - 1, size.height - 1);
+        let at = pixel.max(DVec2::ZERO).as_uvec2().min(last) / SUB_TILE_EDGE;
+        let entry = self.index.sub_tile(level as usize, at.x, at.y);
+        entry.is_none_or(|e| e.is_blank())
+    }
+}
+
+/// Names a sub-tile while its pyramid is open.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) struct SubTileKey {
+    pyramid: u64,
+    level: u32,
+    at: UVec2,
+}
+
+/// A sub-tile as it was read or, better, as it was decoded before.
+pub(super) enum Fetched {
+    Encoded(Bytes),
+    Decoded(Bytes),
+}
+
+#[derive(Clone)]
+struct Bytewise;
+
+impl Weighter<SubTileKey, Bytes> for Bytewise {
+    fn weight(&self, _: &SubTileKey, voxels: &Bytes) -> u64 {
+        voxels.len() as u64 + 64
+    }
+}
+
+impl Weighter<Box<str>, Arc<Pyramid>> for Bytewise {
+    fn weight(&self, name: &Box<str>, pyramid: &Arc<Pyramid>) -> u64 {
+        (pyramid.index.memory() + name.len() + 64) as u64
+    }
+}
+
+pub(super) struct Tiles {
+    catalog: Catalog,
+    storage: Arc<dyn Storage>,
+    volume: Box<str>,
+    /// Sections that have, or had, a tile.
+    acquired: Mutex<BTreeSet<u32>>,
+    sections: Mutex<BTreeMap<u32, Arc<OnceCell<Arc<SectionIndex>>>>>,
+    pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
+    sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
+    next_serial: AtomicU64,
+    decoded: AtomicU64,
+}
+
+impl Tiles {
+    pub(super) fn new(
+        archive: &VisualizationArchive,
+        volume: &Volume,
+        options: &StitchedOptions,
+    ) -> Self {
+        let items = |bytes: u64, each: usize| {
+            usize::try_from(bytes)
+                .map_or(usize::MAX, |b| b / each)
+                .clamp(16, 1 << 20)
+        };
+        Self {
+            catalog: archive.catalog().clone(),
+            storage: archive.storage().clone(),
+            volume: volume.name.as_str().into(),
+            acquired: Mutex::default(),
+            sections: Mutex::default(),
+            pyramids: Cache::with_weighter(
+                items(options.index_bytes, 64 << 10),
+                options.index_bytes,
+                Bytewise,
+            ),
+            sub_tiles: Cache::with_weighter(
+                items(options.sub_tile_bytes, SUB_TILE_VOXELS),
+                options.sub_tile_bytes,
+                Bytewise,
+            ),
+            next_serial: AtomicU64::new(0),
+            decoded: AtomicU64::new(0),
+        }
+    }
+
+    /// Reads which sections have a tile.
+    pub(super) async fn load_acquired(&self) -> Result<(), StitchError> {
+        let sections = self.catalog.sections(&self.volume).await;
+        let sections = sections.map_err(|source| StitchError::Catalog { source })?;
+        lock(&self.acquired).extend(sections);
+        Ok(())
+    }
+
+    /// A section has changed: forgets what is known of it.
+    pub(super) fn forget(&self, section: u32) {
+        lock(&self.acquired).insert(section);
+        lock(&self.sections).remove(&section);
+    }
+
+    /// The sections in a range that have a tile.
+    pub(super) fn acquired(&self, sections: Range<u32>) -> Vec<u32> {
+        lock(&self.acquired).range(sections).copied().collect()
+    }
+
+    /// Whether a section in a range has a tile.
+    pub(super) fn any_acquired(&self, sections: Range<u32>) -> bool {
+        !sections.is_empty() && lock(&self.acquired).range(sections).next().is_some()
+    }
+
+    /// The index of a section, loaded on first touch.
+    ///
+    /// A load that was under way when the section changed ends in a cell that nobody asks again.
+    pub(super) async fn section(&self, z: u32) -> Result<Arc<SectionIndex>, StitchError> {
+        let cell = lock(&self.sections).entry(z).or_default().clone();
+        let load = async || {
+            let tiles = self.catalog.section_tiles(&self.volume, z).await;
+            let tiles = tiles.map_err(|source| StitchError::Catalog { source })?;
+            Ok(Arc::new(SectionIndex::new(&tiles)))
+        };
+        cell.get_or_try_init(load).await.cloned()
+    }
+
+    /// The pyramid of a tile, opened if it is not open.
+    pub(super) async fn pyramid(&self, tile: &IndexedTile) -> Result<Arc<Pyramid>, StitchError> {
+        let open = async {
+            let opened = PyramidIndex::open(&*self.storage, &tile.pyramid).await;
+            let index = opened.map_err(|source| {
+                let section = tile.section;
+                StitchError::Tile { source, section }
+            })?;
+            let got = UVec2::new(index.levels()[0].width, index.levels()[0].height);
+            let levels = index.levels().len();
+            if got != tile.size || levels <= tile.coarsest_level() as usize {
+                let (expected, name) = (tile.size, tile.pyramid.to_string());
+                return Err(StitchError::Size {
+                    expected,
+                    got,
+                    name,
+                });
+            }
+            let serial = self.next_serial.fetch_add(1, Ordering::Relaxed);
+            Ok(Arc::new(Pyramid::new(index, serial)))
+        };
+        self.pyramids.get_or_insert_async(&tile.pyramid, open).await
+    }
+
+    /// Fetches sub-tiles of a level, neighbours together; blank ones are left out.
+    pub(super) async fn fetch(
+        &self,
+        pyramid: &Pyramid,
+        section: u32,
+        level: u32,
+        wanted: Vec<UVec2>,
+    ) -> Result<Vec<(UVec2, Fetched)>, StitchError> {
+        let mut fetched = Vec::with_capacity(wanted.len());
+        let mut missing = Vec::new();
+        for at in wanted {
+            match self.sub_tiles.get(&key(pyramid, level, at)) {
+                Some(voxels) => fetched.push((at, Fetched::Decoded(voxels))),
+                None => missing.push(at),
+            }
+        }
+        let reads = pyramid.index.reads(level as usize, missing, GAP);
+        let name = pyramid.index.name();
+        let read = reads.iter().map(async |read| {
+            let bytes = self.storage.read(name, Some(read.range.clone())).await;
+            bytes.map_err(|source| {
+                let name = name.to_owned();
+                let source = saccade_archive::pyramid::PyramidError::Storage { source, name };
+                StitchError::Tile { source, section }
+            })
+        });
+        for (read, bytes) in reads.iter().zip(try_join_all(read).await?) {
+            for (at, within) in &read.sub_tiles {
+                if within.end > bytes.len() {
+                    return Err(StitchError::Cut { name: name.into() });
+                }
+                fetched.push((*at, Fetched::Encoded(bytes.slice(within.clone()))));
+            }
+        }
+        Ok(fetched)
+    }
+
+    /// Decodes a fetched sub-tile, and remembers it.
+    pub(super) fn decode(
+        &self,
+        pyramid: &Pyramid,
+        section: u32,
+        level: u32,
+        at: UVec2,
+        fetched: Fetched,
+    ) -> Result<Bytes, StitchError> {
+        let bytes = match fetched {
+            Fetched::Decoded(voxels) => return Ok(voxels),
+            Fetched::Encoded(bytes) => bytes,
+        };
+        let decoded = pyramid
+            .index
+            .decode_sub_tile(level as usize, at.x, at.y, &bytes);
+        let voxels = decoded.map_err(|source| StitchError::Tile { source, section })?;
+        let voxels = Bytes::from(voxels);
+        self.decoded.fetch_add(1, Ordering::Relaxed);
+        self.sub_tiles
+            .insert(key(pyramid, level, at), voxels.clone());
+        Ok(voxels)
+    }
+
+    /// Sub-tiles decoded so far.
+    pub(super) fn decoded(&self) -> u64 {
+        self.decoded.load(Ordering::Relaxed)
+    }
+
+    /// Tiles in the section indices, and their memory \[bytes\].
+    pub(super) fn indexed(&self) -> (u64, u64) {
+        let sections = lock(&self.sections);
+        let loaded = sections.values().filter_map(|cell| cell.get());
+        loaded.fold((0, 0), |(tiles, bytes), index| {
+            (tiles + index.tiles() as u64, bytes + index.memory() as u64)
+        })
+    }
+}
+
+fn key(pyramid: &Pyramid, level: u32, at: UVec2) -> SubTileKey {
+    SubTileKey {
+        pyramid: pyramid.serial,
+        level,
+        at,
+    }
+}
+
+/// Every change under these locks is one insertion or removal: whole even after a panic.
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
