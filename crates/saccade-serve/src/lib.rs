@@ -37,6 +37,7 @@
 //! It holds no state but the recent changes of each volume, limits no builds (sources do), knows no
 //! users and no encryption: it listens on this computer only, unless told otherwise.
 
+mod archive;
 mod assets;
 mod events;
 mod history;
@@ -47,6 +48,7 @@ mod status;
 mod volumes;
 mod zarr;
 
+pub use archive::{OfferError, follow_archive, offer_archive};
 pub use server::{Compress, Options, ServeError, Server};
 pub use status::{CatalogStatus, Quarantined, Status, StatusError, StatusSource};
 pub use volumes::Volumes;

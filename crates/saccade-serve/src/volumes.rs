@@ -7,14 +7,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use futures::StreamExt;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
-use saccade_source::maybe_send::BoxStream;
-use saccade_source::{Change, ChunkId, VolumeSource};
+use saccade_source::{ChunkId, VolumeSource};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::history::History;
 use crate::http::Tag;
-use crate::status::{StatusError, StatusSource};
+use crate::status::StatusSource;
 
 /// The volumes on offer, by name. Clones share the same set, which may grow at any time.
 #[derive(Clone, Default)]
@@ -28,30 +27,15 @@ impl Volumes {
 
     /// Offers a volume under the name it has, in place of one that had the name.
     ///
-    /// `status` also knows the volume's revision, 0 without it. Must be called within a Tokio
-    /// runtime: a task follows the source until the volume is replaced.
-    ///
-    /// # Errors
-    ///
-    /// [`StatusError`] if the state cannot be read; the volume is then not offered.
-    pub async fn publish(
-        &self,
-        source: Arc<dyn VolumeSource>,
-        status: Option<Arc<dyn StatusSource>>,
-    ) -> Result<(), StatusError> {
-        // Listen first: a change that comes now is then in the revision, in the stream or in both.
-        let changes = source.changes();
-        let revision = match &status {
-            Some(status) => status.status().await?.revision,
-            None => 0,
-        };
-        let published = Arc::new(Published::new(source, changes, revision, status));
+    /// Must be called within a Tokio runtime: a task follows the source until the volume is
+    /// replaced.
+    pub fn publish(&self, source: Arc<dyn VolumeSource>, status: Option<Arc<dyn StatusSource>>) {
+        let published = Arc::new(Published::new(source, status));
         let name = published.volume().name.clone();
         self.0
             .write()
             .unwrap_or_else(PoisonError::into_inner)
             .insert(name, published);
-        Ok(())
     }
 
     /// Names, in order.
@@ -95,12 +79,10 @@ pub(crate) struct Published {
 }
 
 impl Published {
-    fn new(
-        source: Arc<dyn VolumeSource>,
-        mut changes: BoxStream<'static, Change>,
-        revision: u64,
-        status: Option<Arc<dyn StatusSource>>,
-    ) -> Self {
+    fn new(source: Arc<dyn VolumeSource>, status: Option<Arc<dyn StatusSource>>) -> Self {
+        // Listen first: a change that comes now is then in the revision, in the stream or in both.
+        let mut changes = source.changes();
+        let revision = source.revision();
         let history = Arc::new(Mutex::new(History::new(source.volume(), revision)));
         let (behind, end) = watch::channel(0);
         let name = source.volume().name.clone();

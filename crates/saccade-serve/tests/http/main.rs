@@ -81,7 +81,7 @@ async fn serve_source(
     JoinHandle<Result<(), ServeError>>,
 ) {
     let volumes = Volumes::new();
-    volumes.publish(source, None).await.unwrap();
+    volumes.publish(source, None);
     let server = Server::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
         .await
         .unwrap();
