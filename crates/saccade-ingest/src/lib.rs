@@ -22,6 +22,7 @@
 mod cancel;
 pub mod ingest;
 mod progress;
+pub mod replay;
 pub mod simulate;
 
 pub use cancel::Cancel;

@@ -15,18 +15,15 @@
 //! Nothing is overwritten: an archive with the same settings is continued after the last tile
 //! recorded, one with other settings is refused. A tile is visible whole or not at all, and before its record.
 
-use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
 use std::{fs, io};
 
 use glam::{DVec3, UVec2};
-use saccade_archive::acquisition::{
-    AcquisitionError, AcquisitionInfo, Cursor, Record, RecordReader, RecordWriter, TileRecord,
-    TransformRecord,
-};
+use saccade_archive::acquisition::{AcquisitionError, Record, TileRecord, TransformRecord};
 use saccade_archive::image::GrayImage;
 
+pub(crate) mod archive;
 pub mod clock;
 mod cut;
 mod plan;
@@ -37,6 +34,7 @@ pub use cut::cut;
 pub use plan::{Plan, PlannedTile};
 
 use crate::{Cancel, Meter, Progress, State};
+use archive::Archive;
 use clock::{Clock, Pace};
 use stack::{Stack, StackError};
 
@@ -218,61 +216,32 @@ pub fn run(
 
 type CutTile = (PlannedTile, Result<GrayImage, StackError>);
 
-/// The acquisition archive being written.
-struct Archive {
-    folder: PathBuf,
-    records: RecordWriter,
-    /// Tiles already recorded, by name.
-    written: HashSet<String>,
-    /// Tiles already corrected, by name.
-    corrected: HashSet<String>,
-}
-
-impl Archive {
-    fn open(folder: &Path, info: &AcquisitionInfo) -> Result<Self, SimulateError> {
-        match AcquisitionInfo::read(folder) {
-            Ok(found) if found != *info => {
-                let say =
-                    |info: &AcquisitionInfo| format!("{} of {} voxels", info.name, info.extent);
-                let (found, wanted) = (say(&found), say(info));
-                return Err(SimulateError::OtherArchive {
-                    found,
-                    wanted,
-                    path: folder.to_owned(),
-                });
-            }
-            Ok(_) => {}
-            // Not there yet; whatever else is wrong, writing will say.
-            Err(_) => info.write(folder)?,
-        }
-        let tiles = folder.join("tiles");
-        fs::create_dir_all(&tiles).map_err(|source| SimulateError::Write {
-            source,
-            path: tiles,
-        })?;
-        let (mut written, mut corrected) = (HashSet::new(), HashSet::new());
-        let mut reader = RecordReader::new(folder, Cursor::default());
-        loop {
-            let lines = reader.read(4096)?;
-            if lines.is_empty() {
-                break;
-            }
-            for line in lines {
-                match line.record {
-                    Ok(Record::Tile(tile)) => _ = written.insert(tile.tile),
-                    Ok(Record::Transform(moved)) => _ = corrected.insert(moved.tile),
-                    Err(_) => {}
-                }
-            }
-        }
-        let records = RecordWriter::open(folder)?;
-        Ok(Self {
-            folder: folder.to_owned(),
-            records,
-            written,
-            corrected,
+/// Refuses what neither simulator nor replay can do.
+pub(crate) fn check_rate_and_voxel(
+    rate_mpixel_s: Option<f64>,
+    voxel_nm: DVec3,
+) -> Result<(), SimulateError> {
+    let wrong = |setting, value: &dyn std::fmt::Display, must| {
+        let value = value.to_string();
+        Err(SimulateError::Setting {
+            setting,
+            value,
+            must,
         })
+    };
+    if let Some(rate) = rate_mpixel_s
+        && !(rate.is_finite() && rate >= 1e-6)
+    {
+        return wrong("the rate", &rate, "more than 0 Mpixel/s");
     }
+    if !(voxel_nm.is_finite() && voxel_nm.min_element() > 0.0) {
+        return wrong(
+            "the voxel size",
+            &voxel_nm,
+            "positive, in nanometres as x,y,z",
+        );
+    }
+    Ok(())
 }
 
 /// The writing half of a run.

@@ -82,21 +82,10 @@ impl Plan {
                 return wrong(setting, &value, "0 or more");
             }
         }
-        if let Some(rate) = config.rate_mpixel_s
-            && !(rate.is_finite() && rate >= 1e-6)
-        {
-            return wrong("the rate", &rate, "more than 0 Mpixel/s");
-        }
         let voxel_nm = config
             .voxel_nm
             .unwrap_or_else(|| stack.voxel_nm_or_assumed());
-        if !(voxel_nm.is_finite() && voxel_nm.min_element() > 0.0) {
-            return wrong(
-                "the voxel size",
-                &voxel_nm,
-                "positive, in nanometres as x,y,z",
-            );
-        }
+        super::check_rate_and_voxel(config.rate_mpixel_s, voxel_nm)?;
         let name = config.name.clone().unwrap_or_else(|| stack.name.clone());
         let size = config.tile.as_dvec2();
         let overlap = size * config.overlap;

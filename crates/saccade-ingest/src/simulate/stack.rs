@@ -15,6 +15,8 @@ pub use pages::TiffPages;
 pub use phantom::PhantomStack;
 pub use sections::SectionFolder;
 
+pub(crate) use files::volume_name;
+
 /// What a stack is.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StackInfo {
@@ -146,6 +148,23 @@ pub fn open(path: &Path) -> Result<Box<dyn Stack>, StackError> {
     Err(StackError::Unknown {
         path: path.to_owned(),
     })
+}
+
+/// Sections that a folder seems to hold: image files by name, or 1 for an OME-Zarr.
+pub(crate) fn count(folder: &Path) -> i64 {
+    if is_zarr(folder) {
+        return 1;
+    }
+    files::sections_of(folder).map_or(0, |sections| {
+        i64::try_from(sections.len()).unwrap_or(i64::MAX)
+    })
+}
+
+/// Whether a folder is a Zarr hierarchy.
+pub(crate) fn is_zarr(folder: &Path) -> bool {
+    [".zattrs", ".zgroup", "zarr.json"]
+        .iter()
+        .any(|file| folder.join(file).is_file())
 }
 
 /// Refuses what lies outside; implementations call it first.

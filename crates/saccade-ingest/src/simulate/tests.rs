@@ -6,6 +6,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use glam::{DVec2, DVec3, UVec2, UVec3};
+use saccade_archive::acquisition::{AcquisitionInfo, Cursor, RecordReader};
 use saccade_core::transform::{SectionFromTile, SectionPoint, TilePoint};
 use tempfile::TempDir;
 use tiff::decoder::{Decoder, DecodingResult};

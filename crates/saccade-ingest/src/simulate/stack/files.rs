@@ -76,7 +76,7 @@ fn number(text: &str) -> (&str, &str) {
 }
 
 /// A name fit for addresses and files, from a file or folder; generic names get their parent's too.
-pub(super) fn volume_name(path: &Path) -> String {
+pub(crate) fn volume_name(path: &Path) -> String {
     let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let clean = |part: &Path| -> String {
         let name = part

@@ -1,0 +1,228 @@
+//! A microscope's tiles in one frame: where the stage said, and where registration says.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+use glam::{DVec2, UVec2, UVec3};
+use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
+use saccade_archive::acquisition::trakem2::{self, Patch};
+use saccade_archive::image::decode_file;
+use saccade_core::transform::{SectionFromTile, TilePoint};
+use tiff::decoder::Decoder;
+
+use super::ReplayError;
+use crate::simulate::stack::volume_name;
+
+/// A tile as it came from the microscope.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RawTile {
+    /// Name, unique in the acquisition.
+    pub name: String,
+    /// Its file.
+    pub image: PathBuf,
+    /// Section: z index, from 0.
+    pub section: u32,
+    /// Width and height \[pixels\].
+    pub size: UVec2,
+    /// Where the stage says it lies.
+    pub stage: SectionFromTile,
+    /// Where the solution says it lies.
+    pub aligned: Option<SectionFromTile>,
+}
+
+/// Tiles with stage positions, and a solution if there is one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Acquisition {
+    /// A name for the volume.
+    pub name: String,
+    /// The tile list that was used.
+    pub list: PathBuf,
+    /// The solution that was used.
+    pub solution: Option<PathBuf>,
+    /// Size that holds every tile, where the stage and where the solution says \[voxels\].
+    pub extent: UVec3,
+    /// In the order of acquisition: by section, then as listed.
+    pub tiles: Vec<RawTile>,
+}
+
+impl Acquisition {
+    /// Reads a tile list, the sizes of its images, which lie anywhere below `folder`, and a TrakEM2
+    /// solution.
+    ///
+    /// The two frames differ by a translation, for a stage's zero means nothing to a solver. The
+    /// median offset is taken out of the solution, so that the update refines rather than jumps.
+    ///
+    /// # Errors
+    ///
+    /// [`ReplayError`].
+    pub fn open(folder: &Path, list: &Path, solution: Option<&Path>) -> Result<Self, ReplayError> {
+        let listed = tile_list::read(list)?;
+        let images = Images::below(folder)?;
+        let patches = solution.map(trakem2::read).transpose()?;
+        Self::new(
+            folder,
+            &images,
+            list,
+            &listed,
+            solution.zip(patches.as_deref()),
+        )
+    }
+
+    pub(super) fn new(
+        folder: &Path,
+        images: &Images,
+        list: &Path,
+        listed: &[ListedTile],
+        solution: Option<(&Path, &[Patch])>,
+    ) -> Result<Self, ReplayError> {
+        let names = unique_names(listed);
+        let first_section = listed.iter().map(|tile| tile.section).min().unwrap_or(0);
+        let patches: BTreeMap<&str, &Patch> = solution
+            .iter()
+            .flat_map(|(_, patches)| *patches)
+            .map(|p| (p.name(), p))
+            .collect();
+
+        let missing: Vec<_> = listed
+            .iter()
+            .filter(|t| images.find(&t.file).is_none())
+            .collect();
+        if let Some(first) = missing.first() {
+            return Err(ReplayError::MissingImages {
+                missing: missing.len(),
+                tiles: listed.len(),
+                first: first.file.clone(),
+                folder: folder.to_owned(),
+                list: list.to_owned(),
+            });
+        }
+        let mut tiles = Vec::new();
+        for (tile, name) in listed.iter().zip(names) {
+            let Some(image) = images.find(&tile.file) else {
+                continue;
+            };
+            let size = image_size(&image)?;
+            tiles.push(RawTile {
+                name,
+                size,
+                image,
+                section: tile.section - first_section,
+                stage: SectionFromTile::translation(tile.corner),
+                aligned: patches.get(tile.name()).map(|patch| patch.transform),
+            });
+        }
+        tiles.sort_by_key(|tile| tile.section);
+        remove_median_offset(&mut tiles);
+        let extent = move_to_origin(&mut tiles, list)?;
+        Ok(Self {
+            name: volume_name(folder),
+            list: list.to_owned(),
+            solution: solution.map(|(path, _)| path.to_owned()),
+            extent,
+            tiles,
+        })
+    }
+}
+
+/// The files' names without folders, or with them where that is ambiguous.
+fn unique_names(listed: &[ListedTile]) -> Vec<String> {
+    let distinct: BTreeSet<&str> = listed.iter().map(ListedTile::name).collect();
+    let safe = |text: &str| -> String {
+        let fit = |c: char| {
+            if c.is_alphanumeric() || "-_.".contains(c) {
+                c
+            } else {
+                '_'
+            }
+        };
+        text.chars().map(fit).collect()
+    };
+    if distinct.len() == listed.len() {
+        return listed.iter().map(|tile| safe(tile.name())).collect();
+    }
+    // The place in the list makes even a tile listed twice two tiles.
+    listed
+        .iter()
+        .enumerate()
+        .map(|(n, tile)| format!("{n:05}_{}", safe(tile.name())))
+        .collect()
+}
+
+/// Width and height of an image, from its head where the format allows it.
+fn image_size(path: &Path) -> Result<UVec2, ReplayError> {
+    let head = || {
+        let mut tiff = Decoder::new(BufReader::new(File::open(path).ok()?)).ok()?;
+        tiff.dimensions().ok()
+    };
+    if let Some((width, height)) = head() {
+        return Ok(UVec2::new(width, height));
+    }
+    match decode_file(path) {
+        Ok(image) => Ok(UVec2::new(image.width, image.height)),
+        Err(source) => Err(ReplayError::Image {
+            source,
+            path: path.to_owned(),
+        }),
+    }
+}
+
+fn centre(transform: SectionFromTile, size: UVec2) -> DVec2 {
+    transform.apply(TilePoint(size.as_dvec2() / 2.0)).0
+}
+
+/// The median offset of solution from stage, per axis.
+pub(super) fn median_offset(tiles: &[RawTile]) -> Option<DVec2> {
+    let offset =
+        |tile: &RawTile| Some(centre(tile.aligned?, tile.size) - centre(tile.stage, tile.size));
+    let offsets: Vec<DVec2> = tiles.iter().filter_map(offset).collect();
+    let median = |mut values: Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        values.get(values.len() / 2).copied()
+    };
+    let x = median(offsets.iter().map(|o| o.x).collect())?;
+    let y = median(offsets.iter().map(|o| o.y).collect())?;
+    Some(DVec2::new(x, y))
+}
+
+fn remove_median_offset(tiles: &mut [RawTile]) {
+    if let Some(offset) = median_offset(tiles) {
+        for tile in tiles {
+            tile.aligned = tile.aligned.map(|aligned| aligned.shifted(-offset));
+        }
+    }
+}
+
+/// Moves all tiles so that the low corner of everything is the origin; the extent that holds them.
+fn move_to_origin(tiles: &mut [RawTile], list: &Path) -> Result<UVec3, ReplayError> {
+    let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for tile in &*tiles {
+        for transform in [Some(tile.stage), tile.aligned].into_iter().flatten() {
+            let (min, max) = transform.bounds(tile.size.as_dvec2());
+            (low, high) = (low.min(min.0), high.max(max.0));
+        }
+    }
+    let low = low.floor();
+    let size = (high - low).ceil();
+    // Also catches an empty list, whose size is not a number.
+    if !(size.cmpge(DVec2::ONE).all() && size.cmple(DVec2::splat(f64::from(1 << 21))).all()) {
+        let list = list.to_owned();
+        return Err(ReplayError::Extent {
+            width: size.x,
+            height: size.y,
+            list,
+        });
+    }
+    for tile in &mut *tiles {
+        tile.stage = tile.stage.shifted(-low);
+        tile.aligned = tile.aligned.map(|aligned| aligned.shifted(-low));
+    }
+    let sections = tiles
+        .iter()
+        .map(|tile| tile.section)
+        .max()
+        .unwrap_or(0)
+        .saturating_add(1);
+    Ok(size.as_uvec2().extend(sections))
+}

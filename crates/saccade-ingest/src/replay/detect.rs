@@ -1,0 +1,279 @@
+//! What is in a folder that somebody points at.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
+use saccade_archive::acquisition::trakem2::{self, Patch};
+use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
+
+use super::acquisition::median_offset;
+use super::{Acquisition, ReplayError};
+use crate::simulate::stack::{self, Stack};
+
+/// A text file larger than this is no tile list \[bytes\].
+const LARGEST_LIST: u64 = 256 << 20;
+
+/// Something to watch.
+pub enum Input {
+    /// A registered stack, for [`crate::simulate::run`].
+    Stack {
+        /// The stack.
+        stack: Box<dyn Stack>,
+        /// Where it is: the folder or file itself, or one below.
+        path: PathBuf,
+    },
+    /// A real acquisition, for [`super::run`].
+    Acquisition(Acquisition),
+}
+
+impl std::fmt::Debug for Input {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Input({})", self.describe())
+    }
+}
+
+impl Input {
+    /// One line for people: what was found, and which files were chosen.
+    pub fn describe(&self) -> String {
+        match self {
+            Self::Stack { stack, path } => {
+                let extent = stack.info().extent;
+                format!(
+                    "a stack of {} x {} x {} voxels: {}",
+                    extent.x,
+                    extent.y,
+                    extent.z,
+                    path.display()
+                )
+            }
+            Self::Acquisition(acquisition) => {
+                let solution = match &acquisition.solution {
+                    Some(path) => format!("later moved by {}", path.display()),
+                    None => "without a later solution".to_owned(),
+                };
+                let (tiles, sections) = (acquisition.tiles.len(), acquisition.extent.z);
+                let list = acquisition.list.display();
+                format!(
+                    "an acquisition of {tiles} tiles in {sections} sections: {list}, {solution}"
+                )
+            }
+        }
+    }
+}
+
+/// Looks for an acquisition in a folder and below, else for a stack.
+///
+/// - An acquisition has a tile list, `file x y z` per line, whose images lie anywhere below the folder.
+///   Of several such lists the least deep counts, then the first by name. Its solution is the TrakEM2 project that has a
+///   transform for every tile and moves some of them; one with more than translations counts first.
+/// - A stack is the path itself if it can be read as one; else the folder below with section images
+///   whose name speaks of raw images rather than of labels, then the one with most sections, then
+///   the first by name.
+///
+/// # Errors
+///
+/// [`ReplayError`]: what was found but cannot be used, or that nothing was found.
+pub fn detect(path: &Path) -> Result<Input, ReplayError> {
+    if !path.is_dir() || stack::is_zarr(path) {
+        let stack = stack::open(path)?;
+        return Ok(Input::Stack {
+            stack,
+            path: path.to_owned(),
+        });
+    }
+    if path.join(AcquisitionInfo::FILE).is_file() {
+        return Err(ReplayError::AlreadyArchive {
+            path: path.to_owned(),
+        });
+    }
+    let tree = Tree::below(path)?;
+    if let Some(acquisition) = find_acquisition(path, &tree)? {
+        return Ok(Input::Acquisition(acquisition));
+    }
+    find_stack(path, &tree)
+}
+
+/// Files and folders below a folder, in a settled order: less deep first, then by name.
+struct Tree {
+    files: Vec<PathBuf>,
+    folders: Vec<PathBuf>,
+}
+
+impl Tree {
+    fn below(folder: &Path) -> Result<Self, ReplayError> {
+        let (mut files, mut folders) = (Vec::new(), Vec::new());
+        let mut open = vec![folder.to_owned()];
+        while let Some(at) = open.pop() {
+            let failed = |source| AcquisitionError::Read {
+                source,
+                path: at.clone(),
+            };
+            for entry in fs::read_dir(&at).map_err(failed)? {
+                let entry = entry.map_err(failed)?;
+                let kind = entry.file_type().map_err(failed)?;
+                if kind.is_dir() && !stack::is_zarr(&entry.path()) {
+                    open.push(entry.path());
+                } else if kind.is_dir() {
+                    folders.push(entry.path());
+                } else {
+                    files.push(entry.path());
+                }
+            }
+            folders.push(at);
+        }
+        let settle = |paths: &mut Vec<PathBuf>| {
+            paths.sort_by_cached_key(|path| (path.components().count(), path.clone()));
+        };
+        settle(&mut files);
+        settle(&mut folders);
+        Ok(Self { files, folders })
+    }
+
+    fn with_extension<'a>(&'a self, extension: &'a str) -> impl Iterator<Item = &'a Path> {
+        let matches = move |path: &&PathBuf| {
+            path.extension()
+                .is_some_and(|e| e.eq_ignore_ascii_case(extension))
+        };
+        self.files.iter().filter(matches).map(PathBuf::as_path)
+    }
+}
+
+fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, ReplayError> {
+    let images = Images::below(folder)?;
+    let small = |path: &&Path| fs::metadata(path).is_ok_and(|meta| meta.len() <= LARGEST_LIST);
+    let mut incomplete = None;
+    for list in tree.with_extension("txt").filter(small) {
+        // Most text files are no lists; that is no error.
+        let Ok(listed) = tile_list::read(list) else {
+            continue;
+        };
+        let found = listed
+            .iter()
+            .filter(|tile| images.find(&tile.file).is_some())
+            .count();
+        if found > 0 && found == listed.len() {
+            return Ok(Some(with_solution(folder, tree, &images, list, &listed)?));
+        }
+        if found > 0 && incomplete.is_none() {
+            incomplete = Some((list.to_owned(), listed));
+        }
+    }
+    match incomplete {
+        // Says which images are missing.
+        Some((list, listed)) => Acquisition::new(folder, &images, &list, &listed, None).map(Some),
+        None => Ok(None),
+    }
+}
+
+fn with_solution(
+    folder: &Path,
+    tree: &Tree,
+    images: &Images,
+    list: &Path,
+    listed: &[ListedTile],
+) -> Result<Acquisition, ReplayError> {
+    let wanted: BTreeSet<&str> = listed.iter().map(ListedTile::name).collect();
+    let unsolved = Acquisition::new(folder, images, list, listed, None)?;
+    if wanted.len() < listed.len() {
+        // Names that mean several tiles cannot be looked up in a solution.
+        return Ok(unsolved);
+    }
+    let mut best: Option<(&Path, Vec<Patch>)> = None;
+    for path in tree.with_extension("xml") {
+        let Ok(patches) = trakem2::read(path) else {
+            continue;
+        };
+        let has: BTreeSet<&str> = patches.iter().map(Patch::name).collect();
+        if !wanted.is_subset(&has) || !refines(&unsolved, &patches) {
+            continue;
+        }
+        let better = match &best {
+            None => true,
+            Some((_, known)) => is_affine(&patches) && !is_affine(known),
+        };
+        if better {
+            best = Some((path, patches));
+        }
+    }
+    match &best {
+        None => Ok(unsolved),
+        Some((path, patches)) => {
+            Acquisition::new(folder, images, list, listed, Some((path, patches)))
+        }
+    }
+}
+
+/// Whether any transform does more than move.
+fn is_affine(patches: &[Patch]) -> bool {
+    patches
+        .iter()
+        .any(|patch| patch.transform.elements()[..4] != [1.0, 0.0, 0.0, 1.0])
+}
+
+/// Whether a solution says anything that the stage did not.
+fn refines(acquisition: &Acquisition, patches: &[Patch]) -> bool {
+    if is_affine(patches) {
+        return true;
+    }
+    let mut tiles = acquisition.tiles.clone();
+    for tile in &mut tiles {
+        let patch = patches.iter().find(|patch| patch.name() == tile.name);
+        tile.aligned = patch.map(|patch| patch.transform);
+    }
+    let Some(offset) = median_offset(&tiles) else {
+        return false;
+    };
+    tiles.iter().any(|tile| {
+        let moved = tile
+            .aligned
+            .map(|aligned| aligned.shifted(-offset).elements());
+        let stage = tile.stage.elements();
+        moved.is_some_and(|moved| {
+            let (x, y) = (moved[4] - stage[4], moved[5] - stage[5]);
+            x.abs().max(y.abs()) > 1e-3
+        })
+    })
+}
+
+fn find_stack(path: &Path, tree: &Tree) -> Result<Input, ReplayError> {
+    let mut candidates = Vec::new();
+    for folder in &tree.folders {
+        let sections = stack::count(folder);
+        if sections > 0 {
+            let inside = folder.strip_prefix(path).unwrap_or(folder);
+            // What was pointed at counts before anything below it.
+            let below = !inside.as_os_str().is_empty();
+            let likely = likeness(&inside.to_string_lossy().to_lowercase());
+            candidates.push(((below, -likely, -sections), folder));
+        }
+    }
+    candidates.sort();
+    let mut first_error = None;
+    for (_, folder) in candidates {
+        match stack::open(folder) {
+            Ok(stack) => {
+                return Ok(Input::Stack {
+                    stack,
+                    path: folder.clone(),
+                });
+            }
+            Err(error) => _ = first_error.get_or_insert(error),
+        }
+    }
+    let nothing = || stack::StackError::Empty {
+        path: path.to_owned(),
+    };
+    Err(first_error.unwrap_or_else(nothing).into())
+}
+
+/// How much a folder's name speaks of images of tissue rather than of what was found in them.
+fn likeness(name: &str) -> i64 {
+    let has = |words: &[&str]| words.iter().any(|word| name.contains(word));
+    let images = has(&["raw", "gray", "grey", "image", "section", "em"]);
+    let found = has(&[
+        "label", "seg", "mask", "truth", "membrane", "mito", "synapse", "body", "bodies",
+    ]);
+    i64::from(images && !found) - i64::from(found)
+}

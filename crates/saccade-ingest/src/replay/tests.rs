@@ -1,0 +1,358 @@
+//! Replay on small made-up acquisitions, and on a real one where it is at hand.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use glam::{DVec2, UVec2, UVec3};
+use saccade_archive::acquisition::{Cursor, RecordReader};
+use saccade_archive::image::{GrayImage, decode_file};
+use saccade_core::transform::{SectionFromTile, TilePoint};
+use tempfile::TempDir;
+
+use super::*;
+use crate::simulate::clock::PretendClock;
+use crate::simulate::write::write_part;
+
+/// Writes an image in which every tile differs.
+fn image(path: &Path, size: UVec2, seed: u8) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let count = usize::try_from(size.x * size.y).unwrap();
+    let voxels = (0..count)
+        .map(|n| u8::try_from(n % 200).unwrap() + seed)
+        .collect();
+    let part = write_part(path, &GrayImage::new(size.x, size.y, voxels)).unwrap();
+    fs::rename(part, path).unwrap();
+}
+
+/// Two sections of two tiles of 30 x 20; sections count from 4, the solution's frame is far away.
+fn acquisition() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |file: &str| folder.path().join(file);
+    for (n, name) in (0..).zip(["a", "b", "c", "d"]) {
+        image(&at(&format!("pictures/{name}.tif")), UVec2::new(30, 20), n);
+    }
+    fs::write(at("README.txt"), "Four tiles\nfrom 2026\n").unwrap();
+    fs::write(
+        at("list.txt"),
+        "x/c.tif 0 0 5\nx/a.tif -3 0 4\nx/b.tif 22 0 4\nx/d.tif 24 1 5\n",
+    )
+    .unwrap();
+    let patch = |file: &str, matrix: &str| {
+        format!(
+            r#"<t2_patch width="30" height="20" transform="matrix({matrix})" file_path="/far/{file}.tif"/>"#
+        )
+    };
+    let project = |a: &str, b: &str, c: &str, d: &str| {
+        format!(
+            r#"<trakem2><t2_layer z="0">{}{}</t2_layer><t2_layer z="1">{}{}</t2_layer></trakem2>"#,
+            patch("a", a),
+            patch("b", b),
+            patch("c", c),
+            patch("d", d)
+        )
+    };
+    // The first says what the stage says, moved; the second is incomplete; the third refines.
+    let same = project(
+        "1,0,0,1,97,50",
+        "1,0,0,1,122,50",
+        "1,0,0,1,100,50",
+        "1,0,0,1,124,51",
+    );
+    fs::write(at("a_same.xml"), same).unwrap();
+    fs::write(
+        at("b_part.xml"),
+        format!(
+            r#"<trakem2><t2_layer z="0">{}</t2_layer></trakem2>"#,
+            patch("a", "1,1,0,1,0,0")
+        ),
+    )
+    .unwrap();
+    let refined = project(
+        "1,0,0,1,97,50",
+        "1,0,0,1,123,52",
+        "1,0,0,1,100,50",
+        "1,0.01,-0.01,1,124,51",
+    );
+    fs::write(at("c_refined.xml"), refined).unwrap();
+    folder
+}
+
+fn found(path: &Path) -> Acquisition {
+    match detect(path).unwrap() {
+        Input::Acquisition(acquisition) => acquisition,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn records(folder: &Path) -> Vec<Record> {
+    let lines = RecordReader::new(folder, Cursor::default())
+        .read(usize::MAX)
+        .unwrap();
+    lines.into_iter().map(|line| line.record.unwrap()).collect()
+}
+
+#[test]
+fn lists_and_solutions_are_found_and_share_a_frame() {
+    let folder = acquisition();
+    let acquisition = found(folder.path());
+    assert_eq!(acquisition.list, folder.path().join("list.txt"));
+    assert_eq!(
+        acquisition.solution,
+        Some(folder.path().join("c_refined.xml"))
+    );
+    let order: Vec<_> = acquisition
+        .tiles
+        .iter()
+        .map(|t| (t.name.as_str(), t.section))
+        .collect();
+    assert_eq!(order, [("a", 0), ("b", 0), ("c", 1), ("d", 1)]);
+
+    let corner = |transform: SectionFromTile| transform.apply(TilePoint(DVec2::ZERO)).0;
+    let origin = corner(acquisition.tiles[0].stage);
+    let near = |transform: SectionFromTile, want: DVec2| {
+        let at = corner(transform) - origin;
+        assert!(
+            (at - want).abs().max_element() < 0.5,
+            "{at} is not near {want}"
+        );
+    };
+    // In the frame of `a` on the stage: the median offset, about (100, 50), is gone.
+    near(acquisition.tiles[1].stage, DVec2::new(25.0, 0.0));
+    near(acquisition.tiles[0].aligned.unwrap(), DVec2::new(0.0, 0.0));
+    near(acquisition.tiles[1].aligned.unwrap(), DVec2::new(26.0, 2.0));
+    for tile in &acquisition.tiles {
+        for transform in [tile.stage, tile.aligned.unwrap()] {
+            let (low, high) = transform.bounds(tile.size.as_dvec2());
+            assert!(low.0.min_element() >= 0.0);
+            assert!(high.0.cmple(acquisition.extent.truncate().as_dvec2()).all());
+        }
+    }
+    assert_eq!(acquisition.extent.z, 2);
+    assert!(
+        acquisition.extent.x <= 59,
+        "no larger than needed: {}",
+        acquisition.extent
+    );
+}
+
+#[test]
+fn a_replay_goes_on_where_it_was_and_ends_with_the_solution() {
+    let input = acquisition();
+    let acquisition = found(input.path());
+    let folder = tempfile::tempdir().unwrap();
+    let clock = PretendClock::default();
+    let config = ReplayConfig {
+        rate_mpixel_s: Some(0.0012),
+        ..ReplayConfig::default()
+    };
+
+    struct Stop(Cancel);
+    impl Progress for Stop {
+        fn update(&self, state: &State) {
+            if state.tiles == 2 {
+                self.0.cancel();
+            }
+        }
+        fn notice(&self, _: &str) {}
+    }
+    let stop = Stop(Cancel::new());
+    let first = run(&config, &acquisition, folder.path(), &clock, &stop.0, &stop).unwrap();
+    assert_eq!((first.tiles, first.complete), (2, false));
+    let second = run(
+        &config,
+        &acquisition,
+        folder.path(),
+        &clock,
+        &Cancel::new(),
+        &(),
+    )
+    .unwrap();
+    assert_eq!(
+        (second.tiles, second.corrections, second.complete),
+        (2, 4, true)
+    );
+    // Half a second per tile, one of which was begun twice, and the wait for the solution.
+    let took = clock.now().as_secs_f64();
+    assert!((4.0..4.6).contains(&took), "{took} s");
+
+    let info = AcquisitionInfo::read(folder.path()).unwrap();
+    assert_eq!(info.extent, acquisition.extent);
+    let records = records(folder.path());
+    assert_eq!(records.len(), 8);
+    for (record, tile) in records.iter().zip(&acquisition.tiles) {
+        let Record::Tile(record) = record else {
+            panic!("tiles come first: {record:?}")
+        };
+        assert_eq!((&record.tile, record.section), (&tile.name, tile.section));
+        assert_eq!(record.transform, tile.stage);
+        let copied = decode_file(&folder.path().join(&record.file)).unwrap();
+        assert!(
+            copied == decode_file(&tile.image).unwrap(),
+            "{}",
+            record.file
+        );
+        assert_eq!(UVec2::new(copied.width, copied.height), record.size);
+    }
+    assert!(matches!(&records[4], Record::Transform(moved) if moved.tile == "a"));
+
+    let again = run(
+        &config,
+        &acquisition,
+        folder.path(),
+        &clock,
+        &Cancel::new(),
+        &(),
+    )
+    .unwrap();
+    assert_eq!(
+        (again.tiles, again.corrections, again.complete),
+        (0, 0, true)
+    );
+}
+
+#[test]
+fn what_cannot_be_used_is_said() {
+    let folder = acquisition();
+    fs::remove_file(folder.path().join("pictures/b.tif")).unwrap();
+    let error = detect(folder.path()).unwrap_err();
+    assert!(
+        matches!(&error, ReplayError::MissingImages { missing: 1, tiles: 4, first, .. } if first == "x/b.tif"),
+        "{error}"
+    );
+
+    let empty = tempfile::tempdir().unwrap();
+    assert!(matches!(
+        detect(empty.path()),
+        Err(ReplayError::Stack { .. })
+    ));
+    assert!(matches!(
+        detect(&empty.path().join("none")),
+        Err(ReplayError::Stack { .. })
+    ));
+    fs::write(empty.path().join(AcquisitionInfo::FILE), "{}").unwrap();
+    assert!(matches!(
+        detect(empty.path()),
+        Err(ReplayError::AlreadyArchive { .. })
+    ));
+}
+
+#[test]
+fn of_several_folders_the_raw_images_are_the_stack() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, sections) in [("labels", 4), ("other", 3), ("raw", 2)] {
+        for n in 0..sections {
+            image(
+                &folder.path().join(name).join(format!("{n}.tif")),
+                UVec2::new(9, 7),
+                n,
+            );
+        }
+    }
+    let Input::Stack { stack, path } = detect(folder.path()).unwrap() else {
+        panic!("it is a stack")
+    };
+    assert_eq!(path, folder.path().join("raw"));
+    assert_eq!(stack.info().extent, UVec3::new(9, 7, 2));
+    fs::remove_dir_all(folder.path().join("raw")).unwrap();
+    let Input::Stack { path, .. } = detect(folder.path()).unwrap() else {
+        panic!("it is a stack")
+    };
+    assert_eq!(path, folder.path().join("other"));
+}
+
+/// Real data beside the workspace, or a message that it is missing.
+fn shared(folder: &str) -> Option<PathBuf> {
+    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
+    let shared = std::env::var_os("SACCADE_SHARED").map_or(beside, PathBuf::from);
+    let path = shared.join("data").join(folder);
+    if path.is_dir() {
+        return Some(path);
+    }
+    eprintln!("skipped: {} is not there", path.display());
+    None
+}
+
+#[test]
+fn real_stacks_are_found() {
+    for (folder, inside, extent) in [
+        (
+            "fib25-medulla",
+            "training_sample2/grayscale_maps",
+            UVec3::splat(250),
+        ),
+        ("vnc-sstem/stack1", "raw", UVec3::new(1024, 1024, 20)),
+    ] {
+        let Some(folder) = shared(folder) else { return };
+        let Input::Stack { stack, path } = detect(&folder).unwrap() else {
+            panic!("{} is a stack", folder.display())
+        };
+        assert_eq!(path, folder.join(inside));
+        assert_eq!(stack.info().extent, extent);
+        let last = stack
+            .region(extent.z - 1, UVec2::ZERO, extent.truncate())
+            .unwrap();
+        let mean =
+            last.voxels.iter().map(|v| f64::from(*v)).sum::<f64>() / last.voxels.len() as f64;
+        assert!(
+            (60.0..200.0).contains(&mean),
+            "{mean} is no mean of an EM image"
+        );
+    }
+}
+
+#[test]
+fn a_real_acquisition_is_replayed() {
+    let Some(folder) = shared("at-tutorial-tiles") else {
+        return;
+    };
+    let acquisition = found(&folder);
+    assert!(
+        acquisition.list.ends_with("DEMO_post_mongo/rick0.txt"),
+        "{:?}",
+        acquisition.list
+    );
+    let solution = acquisition.solution.clone().unwrap();
+    assert!(
+        solution.ends_with("temp0_final/stack/Affine.xml"),
+        "{solution:?}"
+    );
+    assert_eq!((acquisition.tiles.len(), acquisition.extent.z), (42, 3));
+
+    // A refinement, not a jump: the solution stays near the stage, though not at it.
+    let mut moves: Vec<f64> = acquisition
+        .tiles
+        .iter()
+        .map(|tile| {
+            let middle = TilePoint(tile.size.as_dvec2() / 2.0);
+            (tile.aligned.unwrap().apply(middle).0 - tile.stage.apply(middle).0).length()
+        })
+        .collect();
+    moves.sort_by(f64::total_cmp);
+    assert!(
+        moves[21] < 300.0,
+        "half of the tiles move by less than {}",
+        moves[21]
+    );
+    assert!(moves[41] > 1.0, "something moves");
+
+    let archive = tempfile::tempdir().unwrap();
+    let config = ReplayConfig::default();
+    let clock = PretendClock::default();
+    let summary = run(
+        &config,
+        &acquisition,
+        archive.path(),
+        &clock,
+        &Cancel::new(),
+        &(),
+    )
+    .unwrap();
+    assert_eq!(
+        (summary.tiles, summary.corrections, summary.complete),
+        (42, 42, true)
+    );
+    assert_eq!(records(archive.path()).len(), 84);
+    let took = clock.now().as_secs_f64();
+    let want = summary.pixels as f64 / 10e6 + 2.0;
+    assert!((took - want).abs() < 1e-3, "{took} s instead of {want} s");
+}
