@@ -216,6 +216,10 @@ impl VolumeSource for StitchedSource {
         self.inner.changes.stream()
     }
 
+    fn revision(&self) -> u64 {
+        self.inner.changes.revision()
+    }
+
     /// Known of chunks that were built and are still held.
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
         id.voxels(&self.inner.volume)?;
