@@ -155,8 +155,12 @@ struct Submitted {
     size: UVec2,
 }
 
-/// How long until it is worth looking whether the GPU has finished a frame.
-const POLL: Duration = Duration::from_millis(4);
+/// How long until it is worth looking whether the GPU has finished a frame, when the last one took
+/// `frame_time`.
+fn poll_after(frame_time: Option<Duration>) -> Duration {
+    let quarter = frame_time.unwrap_or_default() / 4;
+    quarter.clamp(Duration::from_millis(4), Duration::from_millis(50))
+}
 
 impl Session {
     /// Starts listening to the source; nothing is drawn yet.
@@ -356,7 +360,7 @@ impl Session {
             .flatten()
             .min()
             .map(|at| at.saturating_sub(now));
-        let poll = (!self.pending.is_empty()).then_some(POLL);
+        let poll = (!self.pending.is_empty()).then(|| poll_after(self.frame_time));
         let again = if cut || (self.dirty && self.pending.is_empty()) {
             Again::Now
         } else {

@@ -236,7 +236,7 @@ impl App {
             before.fidelity != status.fidelity
                 || before.complete != status.complete
                 || before.settled != status.settled
-                || before.progress != status.progress
+                || before.progress.failure != status.progress.failure
                 || before.revision != status.revision
         });
         if self.ui && news {

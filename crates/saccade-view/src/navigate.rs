@@ -1,6 +1,6 @@
 //! From hands and keys to cameras.
 
-use glam::{DVec2, dvec2};
+use glam::DVec2;
 use saccade_core::camera::Camera;
 
 /// What the user did to the picture since the last frame. Movements are in points.
@@ -51,10 +51,7 @@ pub(crate) fn moved(camera: Camera, input: &Input, height: f64, home: Camera) ->
             input.primary + input.other - keys * KEY_PAN * height,
         )
     } else {
-        (
-            input.primary * TURN / height + keys * KEY_TURN * dvec2(-1.0, 1.0),
-            input.other,
-        )
+        (input.primary * TURN / height - keys * KEY_TURN, input.other)
     };
     pan += input.fingers;
     let mut camera = camera;
@@ -75,7 +72,7 @@ pub(crate) fn moved(camera: Camera, input: &Input, height: f64, home: Camera) ->
 
 #[cfg(test)]
 mod tests {
-    use glam::{DVec3, UVec3};
+    use glam::{DVec3, UVec3, dvec2};
     use saccade_core::volume::Volume;
 
     use super::*;
