@@ -1,16 +1,33 @@
 //! The frame loop.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
-use saccade_core::brick::BrickId;
-use saccade_core::page_table::{PageTableError, PageTableShape};
+use glam::UVec2;
+use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
+use saccade_core::page_table::{PageTableError, PageTableShape, PageTables};
 use saccade_core::transfer::TransferFunction;
-use saccade_core::volume::{Dtype, Volume};
+use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
+use crate::frame::{frame_uniform, transfer_storage};
 use crate::gpu::Gpu;
-use crate::report::{FrameReport, MemoryUse};
-use crate::view::{Image, View};
+use crate::image::{Image, ReadError, read_image};
+use crate::memory::plan::{DeviceLimits, Misfit, Plan, READBACKS};
+use crate::memory::pressure::Pressure;
+use crate::memory::{Frame, Placement, VirtualMemory, Want};
+use crate::readback::{self, Staging};
+use crate::report::{FrameReport, MemoryUse, RawReport};
+use crate::resources::{Picture, Resources};
+use crate::stored_brick::StoredBrick;
+use crate::view::View;
+
+/// Channels drawn: the first.
+const CHANNELS: u32 = 1;
+/// Storage buffers the ray-caster binds.
+const STORAGE_BUFFERS: u64 = 6;
+/// Page table blocks made for one report; the others come with the next.
+const TABLES_PER_FRAME: u32 = 64;
 
 /// What a renderer may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,6 +67,12 @@ pub enum RendererError {
         /// Which part does not fit.
         #[from]
         source: PageTableError,
+    },
+    /// A page table shape that the shaders cannot walk.
+    #[error("page tables cannot be cut as {shape:?}; use depth 2 or 3 and blocks of 16 or 32")]
+    PageTableShape {
+        /// As asked for.
+        shape: PageTableShape,
     },
     /// The ceiling leaves no room to work in.
     #[error("{ceiling} bytes of GPU memory are too few for this volume; allow {needed} or more")]
@@ -114,24 +137,36 @@ pub enum DeliveryError {
     },
 }
 
-/// The picture could not be read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the picture could not be read back from the GPU")]
-pub struct ReadError;
-
 /// Draws one volume. See the crate's documentation for the way of a frame.
 #[derive(Debug)]
 pub struct Renderer {
     gpu: Gpu,
     volume: Arc<Volume>,
     options: RendererOptions,
-    frame: u64,
-    texture: wgpu::Texture,
-    view: wgpu::TextureView,
+    plan: Plan,
+    memory: VirtualMemory,
+    pressure: Pressure,
+    polarity: Polarity,
+    resources: Resources,
+    picture: Picture,
+    readbacks: Vec<Readback>,
+    view: Option<View>,
+    /// Bricks of the latest report: what finds no room matters only if it is among them.
+    wanted: HashSet<BrickId>,
+}
+
+/// A report on its way back.
+#[derive(Debug)]
+struct Readback {
+    staging: Staging,
+    frame: Frame,
+    lod_bias: f32,
+    memory_bias: f32,
 }
 
 impl Renderer {
-    /// Makes the caches for a volume, within the ceiling. No voxel is resident yet.
+    /// Makes the caches for a volume, within the ceiling. No voxel is resident yet, and everything
+    /// is transparent until [`Self::set_transfer_function`].
     ///
     /// # Errors
     ///
@@ -141,30 +176,63 @@ impl Renderer {
         volume: Arc<Volume>,
         options: RendererOptions,
     ) -> Result<Self, RendererError> {
-        let texture = gpu.device().create_texture(&wgpu::TextureDescriptor {
-            label: Some("image"),
-            size: wgpu::Extent3d {
-                width: 1,
-                height: 1,
-                depth_or_array_layers: 1,
+        if volume.dtype != Dtype::Uint8 {
+            return Err(RendererError::Dtype {
+                dtype: volume.dtype,
+            });
+        }
+        let shape = options.page_table_shape;
+        let shape = shape.unwrap_or_else(|| PageTableShape::for_volume(&volume.levels, CHANNELS));
+        if !(shape.block_edge.is_power_of_two() && (2..=3).contains(&shape.depth)) {
+            return Err(RendererError::PageTableShape { shape });
+        }
+        let tables = PageTables::new(&volume.levels, CHANNELS, shape)?;
+        let limits = gpu.device().limits();
+        let buffers = u64::from(limits.max_storage_buffers_per_shader_stage);
+        if buffers < STORAGE_BUFFERS {
+            let what = "storage buffers a shader";
+            return Err(RendererError::Limit {
+                what,
+                offered: buffers,
+                needed: STORAGE_BUFFERS,
+            });
+        }
+        let device = DeviceLimits {
+            texture_edge: limits.max_texture_dimension_3d,
+            buffer: limits
+                .max_buffer_size
+                .min(limits.max_storage_buffer_binding_size),
+        };
+        let ceiling = options.memory_bytes;
+        let plan = Plan::new(&tables, ceiling, device).map_err(|misfit| match misfit {
+            Misfit::Ceiling(needed) => RendererError::Ceiling { ceiling, needed },
+            Misfit::Buffer(needed) => RendererError::Limit {
+                what: "bytes in a storage buffer",
+                offered: device.buffer,
+                needed,
             },
-            mip_level_count: 1,
-            sample_count: 1,
-            dimension: wgpu::TextureDimension::D2,
-            format: wgpu::TextureFormat::Rgba8Unorm,
-            usage: wgpu::TextureUsages::TEXTURE_BINDING
-                | wgpu::TextureUsages::STORAGE_BINDING
-                | wgpu::TextureUsages::COPY_SRC,
-            view_formats: &[],
-        });
-        let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
+        })?;
+        let bands = options.bands.max(1);
+        let resources = Resources::new(gpu, &plan, bands);
+        let readback = |_| Readback {
+            staging: Staging::new(gpu.device(), plan.report_bytes()),
+            frame: 0,
+            lod_bias: 0.0,
+            memory_bias: 0.0,
+        };
         Ok(Self {
             gpu: gpu.clone(),
             volume,
-            options,
-            frame: 0,
-            texture,
-            view,
+            options: RendererOptions { bands, ..options },
+            memory: VirtualMemory::new(tables, plan.blocks, plan.bricks()),
+            pressure: Pressure::default(),
+            polarity: Polarity::default(),
+            picture: resources.picture(gpu, UVec2::ONE),
+            resources,
+            readbacks: (0..READBACKS).map(readback).collect(),
+            plan,
+            view: None,
+            wanted: HashSet::new(),
         })
     }
 
@@ -181,69 +249,226 @@ impl Renderer {
     /// Sets colours and opacities from the next frame on.
     ///
     /// A change of polarity drops all resident bricks, since they are stored by it.
-    pub fn set_transfer_function(&mut self, _transfer: &TransferFunction) {}
+    pub fn set_transfer_function(&mut self, transfer: &TransferFunction) {
+        if transfer.polarity != self.polarity {
+            self.polarity = transfer.polarity;
+            self.memory.drop_bricks();
+        }
+        self.resources
+            .write_transfer(&self.gpu, &transfer_storage(transfer));
+        self.pressure.view_changed();
+    }
 
     /// Records and submits one frame; never waits. Returns its number.
-    pub fn render(&mut self, _view: &View) -> u64 {
-        self.frame += 1;
-        self.frame
+    ///
+    /// Sizes beyond what the device can draw are cut.
+    pub fn render(&mut self, view: &View) -> u64 {
+        if self.view.as_ref() != Some(view) {
+            self.pressure.view_changed();
+            self.view = Some(*view);
+        }
+        let most = self.gpu.device().limits().max_texture_dimension_2d;
+        let size = view.size.clamp(UVec2::ONE, UVec2::splat(most));
+        let view = View { size, ..*view };
+        if size != self.size() {
+            self.picture = self.resources.picture(&self.gpu, size);
+        }
+        let memory_bias = self.pressure.bias();
+        let lod_bias = view.lod_bias + memory_bias;
+        let frame = self.memory.next_frame();
+        let (resources, gpu) = (&self.resources, &self.gpu);
+        self.memory.flush(|array, first, entries| {
+            resources.write_entries(gpu, array, first, entries);
+        });
+        let tables = self.memory.tables();
+        let uniform = frame_uniform(&view, lod_bias, &self.volume, tables, &self.plan);
+        let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());
+        let target = readback.as_ref().map(|r| r.staging.buffer());
+        resources.draw(gpu, &self.picture, &uniform, self.options.bands, target);
+        if let Some(readback) = readback {
+            readback.staging.begin();
+            readback.frame = frame;
+            readback.lod_bias = lod_bias;
+            readback.memory_bias = memory_bias;
+        }
+        self.memory.frame_submitted();
+        frame
     }
 
     /// Reports of frames that have arrived, oldest first. Never waits.
     pub fn poll(&mut self) -> Vec<FrameReport> {
-        Vec::new()
+        readback::pump(self.gpu.device());
+        let mut arrived = Vec::new();
+        for readback in &mut self.readbacks {
+            if readback.staging.is_done() {
+                let words = readback
+                    .staging
+                    .take(bytemuck::pod_collect_to_vec::<u8, u32>);
+                let Readback {
+                    frame,
+                    lod_bias,
+                    memory_bias,
+                    ..
+                } = *readback;
+                match words {
+                    Some(words) => arrived.push((frame, lod_bias, memory_bias, words)),
+                    None => log::warn!("the report of frame {frame} was lost"),
+                }
+            }
+        }
+        arrived.sort_unstable_by_key(|(frame, ..)| *frame);
+        let reports = arrived
+            .into_iter()
+            .map(|(frame, lod_bias, memory_bias, words)| {
+                let mut report = self.read_report(frame, &words);
+                (report.lod_bias, report.memory_bias) = (lod_bias, memory_bias);
+                report
+            });
+        reports.collect()
     }
 
     /// Waits until every frame submitted so far is drawn, and returns all reports that arrived.
     ///
-    /// Natively this blocks the thread for as long as the GPU works.
+    /// Natively this blocks the thread for as long as the GPU works; in a browser it yields.
     pub async fn finish(&mut self) -> Vec<FrameReport> {
-        Vec::new()
+        readback::wait(self.gpu.device());
+        for readback in &self.readbacks {
+            readback.staging.done().await;
+        }
+        self.poll()
     }
 
-    /// Takes a brick.
+    /// Takes a brick. The next frame draws it.
+    ///
+    /// Each brick is 39 kB on its way to the device: bound how many come between two frames.
     ///
     /// # Errors
     ///
     /// [`DeliveryError`] when the brick is not one of this volume's or has the wrong size.
     pub fn deliver(
         &mut self,
-        _id: BrickId,
-        _voxels: BrickVoxels<'_>,
+        id: BrickId,
+        voxels: BrickVoxels<'_>,
     ) -> Result<Delivery, DeliveryError> {
-        Ok(Delivery::Empty)
+        if !self.memory.contains(id) {
+            return Err(DeliveryError::NoSuchBrick { id });
+        }
+        let stored = match voxels {
+            BrickVoxels::Voxels(raw) if raw.len() != BRICK_STORED_VOXELS => {
+                let (got, expected) = (raw.len(), BRICK_STORED_VOXELS);
+                return Err(DeliveryError::Length { id, got, expected });
+            }
+            BrickVoxels::Voxels(raw) => Some(StoredBrick::new(raw, self.polarity)),
+            BrickVoxels::Empty => None,
+        };
+        // Voxels of which none was acquired are as good as none.
+        let placement = match &stored {
+            Some(brick) if brick.range[1] > 0 => self.memory.place(id),
+            _ => self.memory.place_empty(id),
+        };
+        Ok(match (placement, stored) {
+            (Placement::Slot(slot), Some(brick)) => {
+                self.resources
+                    .write_brick(&self.gpu, slot, &brick.voxels, brick.range);
+                Delivery::Resident
+            }
+            (Placement::NoRoom, _) => {
+                if self.wanted.contains(&id) {
+                    self.pressure.refuse();
+                }
+                Delivery::NoRoom
+            }
+            (Placement::Slot(_) | Placement::Empty, _) => Delivery::Empty,
+        })
     }
 
     /// Level-0 voxels changed: their bricks are wanted again at all levels.
     ///
     /// Resident ones stay in the picture until their replacement is delivered, and count as missing.
-    pub fn invalidate(&mut self, _voxels: VoxelBox) {}
+    pub fn invalidate(&mut self, voxels: VoxelBox) {
+        self.memory.invalidate(&self.volume.levels, voxels);
+    }
 
     /// The picture: `Rgba8Unorm` holding sRGB-encoded values, opaque. Replaced when the size of the
     /// view changes.
     pub fn output(&self) -> &wgpu::TextureView {
-        &self.view
+        &self.picture.view
     }
 
     /// The texture of [`Self::output`].
     pub fn output_texture(&self) -> &wgpu::Texture {
-        &self.texture
+        &self.picture.texture
+    }
+
+    /// Size of the picture \[pixels\].
+    pub fn size(&self) -> UVec2 {
+        UVec2::new(self.picture.texture.width(), self.picture.texture.height())
     }
 
     /// The picture in main memory, once all frames submitted are drawn.
+    ///
+    /// Natively this blocks the thread for as long as the GPU works; in a browser it yields.
     ///
     /// # Errors
     ///
     /// [`ReadError`] when the device was lost.
     pub async fn read_pixels(&self) -> Result<Image, ReadError> {
-        Err(ReadError)
+        read_image(&self.gpu, &self.picture.texture).await
     }
 
     /// Memory in use.
     pub fn memory(&self) -> MemoryUse {
+        let (bricks_resident, brick_slots) = self.memory.bricks();
+        let (tables_resident, table_slots) = self.memory.blocks();
+        let UVec2 { x, y } = self.size();
         MemoryUse {
+            bricks: self.plan.brick_bytes(),
+            tables: self.plan.table_bytes(),
+            readback: self.plan.readback_bytes(),
+            image: u64::from(x) * u64::from(y) * 4,
             ceiling: self.options.memory_bytes,
-            ..MemoryUse::default()
+            brick_slots,
+            bricks_resident,
+            table_slots,
+            tables_resident,
+        }
+    }
+
+    /// Digests what a frame met: slots it used, entries it stumbled on.
+    fn read_report(&mut self, frame: Frame, words: &[u32]) -> FrameReport {
+        let report = RawReport::new(words, self.plan.usage_words());
+        let (bricks_used, blocks_used) = self.memory.note_usage(frame, report.usage);
+        let mut misses = Vec::new();
+        let mut tables_made = 0;
+        for entry in report.misses_by_urgency() {
+            match self
+                .memory
+                .want(frame, entry, tables_made < TABLES_PER_FRAME)
+            {
+                Want::Brick(id) => misses.push(id),
+                Want::Table => tables_made += 1,
+                Want::NoRoom => self.pressure.refuse(),
+                Want::Nothing => {}
+            }
+        }
+        self.wanted.clear();
+        self.wanted.extend(&misses);
+        let memory = self.memory();
+        let share = |used, slots| used as f32 / slots as f32;
+        let used = share(bricks_used, memory.brick_slots);
+        let used = used.max(share(blocks_used, memory.table_slots));
+        let fidelity = report.fidelity();
+        let next = self.memory.next_frame();
+        self.pressure
+            .report(frame, next, fidelity.missing == 0, used);
+        FrameReport {
+            frame,
+            misses,
+            fidelity,
+            lod_bias: 0.0,
+            memory_bias: 0.0,
+            statistics: report.statistics(bricks_used, blocks_used),
+            memory,
         }
     }
 }

@@ -1,6 +1,11 @@
 //! What a frame was, read back later.
 
-use saccade_core::brick::BrickId;
+use saccade_core::brick::{BrickId, MAX_LEVELS};
+
+use crate::layout::{
+    COUNT_LOOKUPS, COUNT_MISSES, COUNT_SAMPLES, COUNT_STALE, COUNT_SUBSTITUTED, COUNTERS,
+    FINEST_LEVEL, MISSES, MOST_SUBSTITUTED_LEVELS,
+};
 
 /// What a frame was. Arrives some frames later; not every frame has one.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,10 +55,12 @@ pub struct Statistics {
     pub samples: u32,
     /// Page table walks.
     pub lookups: u32,
-    /// Of `samples`, those from another level than wanted.
+    /// Ray segments drawn from another level than wanted.
     pub substituted: u32,
-    /// Bricks and tables in use.
-    pub slots_used: u32,
+    /// Bricks in use.
+    pub bricks_used: u32,
+    /// Page table blocks in use.
+    pub blocks_used: u32,
 }
 
 /// Memory on the device \[bytes\]. All but the picture stays below the ceiling.
@@ -83,5 +90,64 @@ impl MemoryUse {
     /// What counts against the ceiling.
     pub fn total(&self) -> u64 {
         self.bricks + self.tables + self.readback
+    }
+}
+
+/// A report as the device wrote it.
+#[derive(Debug)]
+pub(crate) struct RawReport<'a> {
+    counters: &'a [u32],
+    /// A bit per brick slot, then per page table block.
+    pub(crate) usage: &'a [u32],
+    misses: &'a [u32],
+}
+
+impl<'a> RawReport<'a> {
+    pub(crate) fn new(words: &'a [u32], usage_words: u32) -> Self {
+        let (counters, rest) = words.split_at(COUNTERS as usize);
+        let (usage, misses) = rest.split_at(usage_words as usize);
+        Self {
+            counters,
+            usage,
+            misses,
+        }
+    }
+
+    fn counter(&self, index: u32) -> u32 {
+        self.counters[index as usize]
+    }
+
+    /// Physical entries missed, most urgent first.
+    pub(crate) fn misses_by_urgency(&self) -> impl Iterator<Item = u32> + use<> {
+        let count = self.counter(COUNT_MISSES).min(MISSES) as usize;
+        let (pairs, _) = self.misses.as_chunks::<2>();
+        // Positive floats sort as their bits do.
+        let mut misses: Vec<_> = pairs[..count]
+            .iter()
+            .map(|[entry, urgency]| (*urgency, *entry))
+            .collect();
+        misses.sort_unstable();
+        misses.into_iter().map(|(_, entry)| entry)
+    }
+
+    pub(crate) fn fidelity(&self) -> Fidelity {
+        let levels = u32::try_from(MAX_LEVELS).expect("32 levels");
+        let level = self.counter(FINEST_LEVEL);
+        Fidelity {
+            missing: self.counter(COUNT_MISSES),
+            stale: self.counter(COUNT_STALE),
+            substituted_levels: self.counter(MOST_SUBSTITUTED_LEVELS),
+            level: (level > 0).then(|| levels.saturating_sub(level)),
+        }
+    }
+
+    pub(crate) fn statistics(&self, bricks_used: u32, blocks_used: u32) -> Statistics {
+        Statistics {
+            samples: self.counter(COUNT_SAMPLES),
+            lookups: self.counter(COUNT_LOOKUPS),
+            substituted: self.counter(COUNT_SUBSTITUTED),
+            bricks_used,
+            blocks_used,
+        }
     }
 }

@@ -36,12 +36,3 @@ impl View {
         }
     }
 }
-
-/// A picture in main memory.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Image {
-    /// Size \[pixels\].
-    pub size: UVec2,
-    /// sRGB-encoded red, green, blue and an opacity of 255; rows from the top, left to right.
-    pub rgba: Vec<u8>,
-}

@@ -1,0 +1,131 @@
+//! From a view to the numbers a frame's shader reads. Here f64 becomes f32.
+
+use bytemuck::Zeroable;
+use glam::{DVec3, IVec3, Vec3};
+use saccade_core::brick::{BRICK_EDGE, MAX_LEVELS};
+use saccade_core::page_table::PageTables;
+use saccade_core::transfer::{TABLE_LEN, TransferFunction};
+use saccade_core::volume::Volume;
+
+use crate::layout::{
+    FLAG_FALSE_COLORS, FLAG_JITTER, FLAG_SUBSTITUTE, FrameUniform, LevelUniform, TransferStorage,
+};
+use crate::memory::plan::Plan;
+use crate::view::View;
+
+/// Anchors stay this near to the volume \[bricks\]; beyond, positions need no precision.
+const ANCHOR_REACH: f64 = 1e6;
+/// More levels than this finer or coarser make no sense.
+const MOST_BIAS: f32 = 32.0;
+
+/// The numbers of a frame. A camera that is not finite sees nothing but background.
+pub(crate) fn frame_uniform(
+    view: &View,
+    lod_bias: f32,
+    volume: &Volume,
+    tables: &PageTables,
+    plan: &Plan,
+) -> FrameUniform {
+    let camera = &view.camera;
+    let axes = camera.physical_from_eye_axes();
+    let eye_nm = camera.eye().xyz;
+    let size = view.size.as_dvec2();
+    let tangent = (camera.fov / 2.0).to_radians().tan();
+    let bias = f64::from(lod_bias.clamp(-MOST_BIAS, MOST_BIAS));
+    let pixel = camera.pixel_nm(1.0, size.y) * bias.exp2();
+    let usable = axes.is_finite() && eye_nm.is_finite() && pixel.is_finite() && pixel > 0.0;
+
+    let mut levels = [LevelUniform::zeroed(); MAX_LEVELS];
+    for ((uniform, level), table) in levels.iter_mut().zip(&volume.levels).zip(tables.levels()) {
+        let voxel_nm = volume.voxel_nm * level.downsampling;
+        let (anchor, eye) = anchored(eye_nm / voxel_nm, table.bricks.as_dvec3());
+        *uniform = LevelUniform {
+            eye,
+            directory_base: table.directory_base,
+            anchor,
+            voxels_per_nm: (1.0 / voxel_nm).as_vec3(),
+            bricks: table.bricks,
+            directory: table.directory,
+            ..LevelUniform::zeroed()
+        };
+    }
+    let flag = |set, flag| if set { flag } else { 0 };
+    FrameUniform {
+        forward: axes.z_axis.as_vec3(),
+        pixel: pixel as f32,
+        right: (axes.x_axis * tangent * size.x / size.y).as_vec3(),
+        level_count: if usable {
+            u32::try_from(volume.levels.len()).unwrap_or(0)
+        } else {
+            0
+        },
+        down: (axes.y_axis * tangent).as_vec3(),
+        flags: flag(view.substitute, FLAG_SUBSTITUTE)
+            | flag(view.false_colors, FLAG_FALSE_COLORS)
+            | flag(view.jitter, FLAG_JITTER),
+        low_nm: (-eye_nm).as_vec3(),
+        depth: tables.shape().depth,
+        high_nm: (volume.size_nm() - eye_nm).as_vec3(),
+        block_edge_log2: tables.shape().block_edge.ilog2(),
+        background: view.background.into(),
+        directory_entries: plan.directory,
+        brick_grid: plan.brick_grid,
+        first_row: 0,
+        size: view.size,
+        usage_words: plan.usage_words(),
+        pad_0: 0,
+        levels,
+    }
+}
+
+/// A position \[voxels\] as a brick near it and the rest, which is small unless it is far outside.
+fn anchored(voxel: DVec3, bricks: DVec3) -> (IVec3, Vec3) {
+    let edge = f64::from(BRICK_EDGE);
+    let reach = DVec3::splat(ANCHOR_REACH);
+    let anchor = (voxel / edge).floor().max(-reach).min(bricks + reach);
+    (anchor.as_ivec3(), (voxel - anchor * edge).as_vec3())
+}
+
+/// The table that the shader reads: opacity as extinction, so that interpolation and step length
+/// commute, and a running count of the entries that can be seen.
+pub(crate) fn transfer_storage(transfer: &TransferFunction) -> TransferStorage {
+    let mut storage = TransferStorage::zeroed();
+    let length_nm = transfer.opacity_length_nm.max(f64::MIN_POSITIVE);
+    for (index, [r, g, b, opacity]) in transfer.table().into_iter().enumerate() {
+        let extinction = -(-f64::from(opacity)).ln_1p() / length_nm;
+        storage.colors[index] = [r, g, b, extinction as f32];
+        let opaque = u32::from(storage.colors[index][3] > 0.0);
+        storage.opaque_before[index + 1] = storage.opaque_before[index] + opaque;
+    }
+    debug_assert!(storage.opaque_before[TABLE_LEN] <= 256, "one per entry");
+    storage
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A voxel of a petascale volume, seen from nearby, stays apart from its neighbour by far.
+    #[test]
+    fn positions_stay_exact_far_from_the_origin() {
+        let bricks = DVec3::splat(62_500.0);
+        let eye = DVec3::new(1_999_987.3, 1_234_567.91, 249_999.53);
+        let (anchor, rest) = anchored(eye, bricks);
+        let restored = anchor.as_dvec3() * 32.0 + rest.as_dvec3();
+        assert!(
+            (restored - eye).abs().max_element() < 1e-5,
+            "{restored} is not {eye}"
+        );
+        assert!(
+            (eye.as_vec3().as_dvec3() - eye).abs().max_element() > 1e-3,
+            "f32 alone is not"
+        );
+    }
+
+    #[test]
+    fn eyes_at_the_end_of_the_world_do_not_overflow() {
+        let (anchor, rest) = anchored(DVec3::new(1e15, -1e15, 3.0), DVec3::splat(4.0));
+        assert_eq!(anchor.z, 0);
+        assert!(anchor.abs().max_element() < 2_000_000 && rest.is_finite());
+    }
+}

@@ -1,0 +1,266 @@
+//! What Rust and WGSL must agree on. The test below compares the two, without a GPU.
+
+use bytemuck::{Pod, Zeroable};
+use glam::{IVec3, UVec2, UVec3, Vec3};
+use saccade_core::brick::MAX_LEVELS;
+use saccade_core::transfer::TABLE_LEN;
+
+/// Edge of a workgroup \[pixels\].
+pub(crate) const WORKGROUP: u32 = 8;
+
+/// Draw missing bricks from other levels.
+pub(crate) const FLAG_SUBSTITUTE: u32 = 1;
+/// Tint substitutes, fog over what is missing.
+pub(crate) const FLAG_FALSE_COLORS: u32 = 2;
+/// Sample segments at a place that differs by pixel.
+pub(crate) const FLAG_JITTER: u32 = 4;
+
+/// Words at the front of a report.
+pub(crate) const COUNTERS: u32 = 16;
+/// Distinct entries missed, also those the list had no room for.
+pub(crate) const COUNT_MISSES: u32 = 0;
+/// Of those, out of date ones.
+pub(crate) const COUNT_STALE: u32 = 1;
+/// Samples taken.
+pub(crate) const COUNT_SAMPLES: u32 = 2;
+/// Page table walks.
+pub(crate) const COUNT_LOOKUPS: u32 = 3;
+/// Segments drawn from another level than wanted.
+pub(crate) const COUNT_SUBSTITUTED: u32 = 4;
+/// Levels between wanted and drawn, at most.
+pub(crate) const MOST_SUBSTITUTED_LEVELS: u32 = 5;
+/// [`MAX_LEVELS`] less the finest level wanted; 0 where no ray met the volume.
+pub(crate) const FINEST_LEVEL: u32 = 6;
+
+/// Misses a report has room for. Others are reported by a later frame.
+pub(crate) const MISSES: u32 = 4096;
+
+/// One level as seen from the eye.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct LevelUniform {
+    pub(crate) eye: Vec3,
+    pub(crate) directory_base: u32,
+    pub(crate) anchor: IVec3,
+    pub(crate) pad_0: u32,
+    pub(crate) voxels_per_nm: Vec3,
+    pub(crate) pad_1: u32,
+    pub(crate) bricks: UVec3,
+    pub(crate) pad_2: u32,
+    pub(crate) directory: UVec3,
+    pub(crate) pad_3: u32,
+}
+
+/// One frame. Fields are explained in `lib/frame.wgsl`.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct FrameUniform {
+    pub(crate) forward: Vec3,
+    pub(crate) pixel: f32,
+    pub(crate) right: Vec3,
+    pub(crate) level_count: u32,
+    pub(crate) down: Vec3,
+    pub(crate) flags: u32,
+    pub(crate) low_nm: Vec3,
+    pub(crate) depth: u32,
+    pub(crate) high_nm: Vec3,
+    pub(crate) block_edge_log2: u32,
+    pub(crate) background: Vec3,
+    pub(crate) directory_entries: u32,
+    pub(crate) brick_grid: UVec3,
+    pub(crate) first_row: u32,
+    pub(crate) size: UVec2,
+    pub(crate) usage_words: u32,
+    pub(crate) pad_0: u32,
+    pub(crate) levels: [LevelUniform; MAX_LEVELS],
+}
+
+/// Colours by stored value.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct TransferStorage {
+    /// Linear RGB, extinction \[1/nm\].
+    pub(crate) colors: [[f32; 4]; TABLE_LEN],
+    /// Entries below an index that are not transparent.
+    pub(crate) opaque_before: [u32; TABLE_LEN + 1],
+    pub(crate) pad_0: [u32; 3],
+}
+
+/// The ray-caster's source: shared files first, the entry point last.
+pub(crate) const RAY_CAST: &str = concat!(
+    include_str!("shaders/lib/constants.wgsl"),
+    include_str!("shaders/lib/frame.wgsl"),
+    include_str!("shaders/lib/ray.wgsl"),
+    include_str!("shaders/lib/color.wgsl"),
+    include_str!("shaders/memory.wgsl"),
+    include_str!("shaders/ray_cast.wgsl"),
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::memory::Entry;
+    use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE};
+    use std::mem::{offset_of, size_of};
+
+    fn module() -> naga::Module {
+        naga::front::wgsl::parse_str(RAY_CAST)
+            .unwrap_or_else(|e| panic!("{}", e.emit_to_string(RAY_CAST)))
+    }
+
+    #[test]
+    fn every_shader_is_valid_without_any_optional_feature() {
+        let mut validator = naga::valid::Validator::new(
+            naga::valid::ValidationFlags::all(),
+            naga::valid::Capabilities::empty(),
+        );
+        let module = module();
+        validator
+            .validate(&module)
+            .unwrap_or_else(|e| panic!("{}", e.emit_to_string(RAY_CAST)));
+        let entries: Vec<_> = module
+            .entry_points
+            .iter()
+            .map(|e| e.name.as_str())
+            .collect();
+        assert_eq!(entries, ["main"]);
+    }
+
+    #[test]
+    fn bindings_stay_within_what_browsers_promise() {
+        let module = module();
+        let limits = wgpu::Limits::default();
+        let of = |wanted: fn(&naga::GlobalVariable, &naga::TypeInner) -> bool| {
+            let globals = module.global_variables.iter();
+            globals
+                .filter(|(_, g)| wanted(g, &module.types[g.ty].inner))
+                .count()
+        };
+        let buffers = of(|g, _| matches!(g.space, naga::AddressSpace::Storage { .. }));
+        assert!(
+            buffers as u32 <= limits.max_storage_buffers_per_shader_stage,
+            "{buffers}"
+        );
+        let images = of(|_, ty| {
+            matches!(
+                ty,
+                naga::TypeInner::Image {
+                    class: naga::ImageClass::Storage { .. },
+                    ..
+                }
+            )
+        });
+        assert!(
+            images as u32 <= limits.max_storage_textures_per_shader_stage,
+            "{images}"
+        );
+    }
+
+    /// Whether a WGSL constant has this value; `None` when there is no such constant.
+    fn constant_is(module: &naga::Module, name: &str, value: u32) -> Option<bool> {
+        let mut constants = module.constants.iter();
+        let (_, constant) = constants.find(|(_, c)| c.name.as_deref() == Some(name))?;
+        let value_is = &module.global_expressions[constant.init];
+        let expected = naga::Expression::Literal(naga::Literal::U32(value));
+        Some(format!("{value_is:?}") == format!("{expected:?}"))
+    }
+
+    #[test]
+    fn constants_agree() {
+        let module = module();
+        let levels = MAX_LEVELS as u32;
+        for (name, value) in [
+            ("WORKGROUP", WORKGROUP),
+            ("BRICK_EDGE", BRICK_EDGE),
+            ("BRICK_BORDER", BRICK_BORDER),
+            ("BRICK_STORED_EDGE", BRICK_STORED_EDGE),
+            ("MAX_LEVELS", levels),
+            ("TABLE_LEN", TABLE_LEN as u32),
+            ("EMPTY", bytemuck::cast(Entry::EMPTY)),
+            ("FIRST_SLOT", Entry::FIRST_SLOT),
+            ("STALE", Entry::STALE),
+            ("FLAG_SUBSTITUTE", FLAG_SUBSTITUTE),
+            ("FLAG_FALSE_COLORS", FLAG_FALSE_COLORS),
+            ("FLAG_JITTER", FLAG_JITTER),
+            ("COUNTERS", COUNTERS),
+            ("COUNT_MISSES", COUNT_MISSES),
+            ("COUNT_STALE", COUNT_STALE),
+            ("COUNT_SAMPLES", COUNT_SAMPLES),
+            ("COUNT_LOOKUPS", COUNT_LOOKUPS),
+            ("COUNT_SUBSTITUTED", COUNT_SUBSTITUTED),
+            ("MOST_SUBSTITUTED_LEVELS", MOST_SUBSTITUTED_LEVELS),
+            ("FINEST_LEVEL", FINEST_LEVEL),
+            ("MISSES", MISSES),
+        ] {
+            assert_eq!(
+                constant_is(&module, name, value),
+                Some(true),
+                "{name} is {value} in Rust"
+            );
+            assert_eq!(
+                constant_is(&module, name, value + 1),
+                Some(false),
+                "a check that can fail"
+            );
+        }
+    }
+
+    /// `(name, offset)` of each member, and the size, as naga lays the struct out.
+    fn wgsl_struct(module: &naga::Module, name: &str) -> (Vec<(String, usize)>, usize) {
+        let mut types = module.types.iter();
+        let (_, ty) = types
+            .find(|(_, ty)| ty.name.as_deref() == Some(name))
+            .unwrap();
+        let naga::TypeInner::Struct { members, span } = &ty.inner else {
+            panic!("{name} is not a struct");
+        };
+        let members = members
+            .iter()
+            .map(|m| (m.name.clone().unwrap(), m.offset as usize));
+        (members.collect(), *span as usize)
+    }
+
+    macro_rules! rust_struct {
+        ($ty:ty, $($field:ident),+) => {
+            (vec![$((stringify!($field).to_owned(), offset_of!($ty, $field))),+], size_of::<$ty>())
+        };
+    }
+
+    #[test]
+    fn structs_agree() {
+        let module = module();
+        let level = rust_struct!(
+            LevelUniform,
+            eye,
+            directory_base,
+            anchor,
+            voxels_per_nm,
+            bricks,
+            directory
+        );
+        assert_eq!(wgsl_struct(&module, "Level"), level);
+        let frame = rust_struct!(
+            FrameUniform,
+            forward,
+            pixel,
+            right,
+            level_count,
+            down,
+            flags,
+            low_nm,
+            depth,
+            high_nm,
+            block_edge_log2,
+            background,
+            directory_entries,
+            brick_grid,
+            first_row,
+            size,
+            usage_words,
+            levels
+        );
+        assert_eq!(wgsl_struct(&module, "Frame"), frame);
+        let transfer = rust_struct!(TransferStorage, colors, opaque_before);
+        assert_eq!(wgsl_struct(&module, "Transfer"), transfer);
+    }
+}

@@ -1,0 +1,332 @@
+//! Everything on the device: caches, buffers, the pipeline.
+
+use glam::{UVec2, UVec3};
+use saccade_core::brick::BRICK_STORED_EDGE;
+
+use crate::gpu::Gpu;
+use crate::layout::{FrameUniform, RAY_CAST, TransferStorage, WORKGROUP};
+use crate::memory::plan::Plan;
+use crate::memory::{Array, Entry};
+
+/// Format of the picture: portable for storage, read as it is by windows.
+pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
+
+/// Everything on the device.
+#[derive(Debug)]
+pub(crate) struct Resources {
+    frames: wgpu::Buffer,
+    frame_stride: u32,
+    directory: wgpu::Buffer,
+    tables: wgpu::Buffer,
+    slot_ranges: wgpu::Buffer,
+    missed: wgpu::Buffer,
+    report: wgpu::Buffer,
+    transfer: wgpu::Buffer,
+    bricks: wgpu::Texture,
+    brick_grid: UVec3,
+    sampler: wgpu::Sampler,
+    pipeline: wgpu::ComputePipeline,
+    layout: wgpu::BindGroupLayout,
+}
+
+/// Where a frame is drawn.
+#[derive(Debug)]
+pub(crate) struct Picture {
+    pub(crate) texture: wgpu::Texture,
+    pub(crate) view: wgpu::TextureView,
+    bind_group: wgpu::BindGroup,
+}
+
+impl Resources {
+    pub(crate) fn new(gpu: &Gpu, plan: &Plan, bands: u32) -> Self {
+        let device = gpu.device();
+        let align = device.limits().min_uniform_buffer_offset_alignment;
+        let frame_stride = size_u32::<FrameUniform>().next_multiple_of(align);
+        let storage = wgpu::BufferUsages::STORAGE;
+        let copy_dst = wgpu::BufferUsages::COPY_DST;
+        let words = |label, words: u32, usage| buffer(device, label, u64::from(words) * 4, usage);
+        let frames_bytes = u64::from(frame_stride) * u64::from(bands);
+        let frames = buffer(
+            device,
+            "frames",
+            frames_bytes,
+            wgpu::BufferUsages::UNIFORM | copy_dst,
+        );
+        let directory = words("page directory", plan.directory, storage | copy_dst);
+        let tables = words("page table cache", plan.table_entries(), storage | copy_dst);
+        let slot_ranges = words("slot ranges", plan.bricks(), storage | copy_dst);
+        let missed = words("missed", plan.mask_words(), storage | copy_dst);
+        let report_usage = storage | copy_dst | wgpu::BufferUsages::COPY_SRC;
+        let report = buffer(device, "report", plan.report_bytes(), report_usage);
+        let transfer_bytes = u64::from(size_u32::<TransferStorage>());
+        let transfer = buffer(
+            device,
+            "transfer function",
+            transfer_bytes,
+            storage | copy_dst,
+        );
+        let bricks = device.create_texture(&wgpu::TextureDescriptor {
+            label: Some("brick cache"),
+            size: extent(plan.brick_grid * BRICK_STORED_EDGE),
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D3,
+            format: wgpu::TextureFormat::R8Unorm,
+            usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+            view_formats: &[],
+        });
+        let sampler = device.create_sampler(&wgpu::SamplerDescriptor {
+            label: Some("trilinear"),
+            mag_filter: wgpu::FilterMode::Linear,
+            min_filter: wgpu::FilterMode::Linear,
+            ..Default::default()
+        });
+        let layout = bind_group_layout(device);
+        let pipeline = pipeline(device, &layout);
+        Self {
+            frames,
+            frame_stride,
+            directory,
+            tables,
+            slot_ranges,
+            missed,
+            report,
+            transfer,
+            bricks,
+            brick_grid: plan.brick_grid,
+            sampler,
+            pipeline,
+            layout,
+        }
+    }
+
+    /// A picture of `size` pixels.
+    pub(crate) fn picture(&self, gpu: &Gpu, size: UVec2) -> Picture {
+        let texture = image_texture(gpu.device(), size);
+        let view = texture.create_view(&wgpu::TextureViewDescriptor::default());
+        let bricks = self
+            .bricks
+            .create_view(&wgpu::TextureViewDescriptor::default());
+        let frame = wgpu::BufferBinding {
+            buffer: &self.frames,
+            offset: 0,
+            size: wgpu::BufferSize::new(u64::from(size_u32::<FrameUniform>())),
+        };
+        let resources = [
+            wgpu::BindingResource::Buffer(frame),
+            self.directory.as_entire_binding(),
+            self.tables.as_entire_binding(),
+            self.slot_ranges.as_entire_binding(),
+            self.missed.as_entire_binding(),
+            self.report.as_entire_binding(),
+            self.transfer.as_entire_binding(),
+            wgpu::BindingResource::TextureView(&bricks),
+            wgpu::BindingResource::Sampler(&self.sampler),
+            wgpu::BindingResource::TextureView(&view),
+        ];
+        let entries = (0..).zip(resources);
+        let entries = entries.map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource });
+        let bind_group = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some("ray-caster"),
+            layout: &self.layout,
+            entries: &entries.collect::<Vec<_>>(),
+        });
+        Picture {
+            texture,
+            view,
+            bind_group,
+        }
+    }
+
+    pub(crate) fn write_transfer(&self, gpu: &Gpu, transfer: &TransferStorage) {
+        gpu.queue()
+            .write_buffer(&self.transfer, 0, bytemuck::bytes_of(transfer));
+    }
+
+    pub(crate) fn write_entries(&self, gpu: &Gpu, array: Array, first: u32, entries: &[Entry]) {
+        let buffer = match array {
+            Array::Directory => &self.directory,
+            Array::Tables => &self.tables,
+        };
+        gpu.queue()
+            .write_buffer(buffer, u64::from(first) * 4, bytemuck::cast_slice(entries));
+    }
+
+    /// Writes a brick with its border, and the range of its values.
+    pub(crate) fn write_brick(&self, gpu: &Gpu, slot: u32, voxels: &[u8], range: [u8; 2]) {
+        let UVec3 { x, y, .. } = self.brick_grid;
+        let cell = UVec3::new(slot % x, slot / x % y, slot / (x * y));
+        let at = cell * BRICK_STORED_EDGE;
+        let target = wgpu::TexelCopyTextureInfo {
+            texture: &self.bricks,
+            mip_level: 0,
+            origin: wgpu::Origin3d {
+                x: at.x,
+                y: at.y,
+                z: at.z,
+            },
+            aspect: wgpu::TextureAspect::All,
+        };
+        let rows = wgpu::TexelCopyBufferLayout {
+            offset: 0,
+            bytes_per_row: Some(BRICK_STORED_EDGE),
+            rows_per_image: Some(BRICK_STORED_EDGE),
+        };
+        let size = extent(UVec3::splat(BRICK_STORED_EDGE));
+        gpu.queue().write_texture(target, voxels, rows, size);
+        let range = [range[0], range[1], 0, 0];
+        gpu.queue()
+            .write_buffer(&self.slot_ranges, u64::from(slot) * 4, &range);
+    }
+
+    /// Submits a frame, in bands; at last copies its report where it can be read.
+    pub(crate) fn draw(
+        &self,
+        gpu: &Gpu,
+        picture: &Picture,
+        frame: &FrameUniform,
+        bands: u32,
+        report: Option<&wgpu::Buffer>,
+    ) {
+        let groups = frame.size.map(|pixels| pixels.div_ceil(WORKGROUP));
+        let per_band = groups.y.div_ceil(bands.max(1)).max(1);
+        let bands = groups.y.div_ceil(per_band);
+        for band in 0..bands {
+            let first = band * per_band;
+            let uniform = FrameUniform {
+                first_row: first * WORKGROUP,
+                ..*frame
+            };
+            let at = band * self.frame_stride;
+            gpu.queue()
+                .write_buffer(&self.frames, u64::from(at), bytemuck::bytes_of(&uniform));
+        }
+        for band in 0..bands {
+            let mut encoder = gpu.device().create_command_encoder(&Default::default());
+            if band == 0 {
+                encoder.clear_buffer(&self.missed, 0, None);
+                encoder.clear_buffer(&self.report, 0, None);
+            }
+            {
+                let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+                    label: Some("ray-caster"),
+                    timestamp_writes: None,
+                });
+                pass.set_pipeline(&self.pipeline);
+                pass.set_bind_group(0, &picture.bind_group, &[band * self.frame_stride]);
+                let rows = per_band.min(groups.y - band * per_band);
+                pass.dispatch_workgroups(groups.x, rows, 1);
+            }
+            if let (true, Some(target)) = (band + 1 == bands, report) {
+                encoder.copy_buffer_to_buffer(&self.report, 0, target, 0, target.size());
+            }
+            gpu.queue().submit([encoder.finish()]);
+        }
+    }
+}
+
+fn size_u32<T>() -> u32 {
+    u32::try_from(size_of::<T>()).expect("structs of a few kilobytes")
+}
+
+fn extent(size: UVec3) -> wgpu::Extent3d {
+    wgpu::Extent3d {
+        width: size.x,
+        height: size.y,
+        depth_or_array_layers: size.z,
+    }
+}
+
+fn buffer(
+    device: &wgpu::Device,
+    label: &str,
+    size: u64,
+    usage: wgpu::BufferUsages,
+) -> wgpu::Buffer {
+    let label = Some(label);
+    device.create_buffer(&wgpu::BufferDescriptor {
+        label,
+        size,
+        usage,
+        mapped_at_creation: false,
+    })
+}
+
+fn image_texture(device: &wgpu::Device, size: UVec2) -> wgpu::Texture {
+    device.create_texture(&wgpu::TextureDescriptor {
+        label: Some("picture"),
+        size: extent(size.extend(1)),
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format: IMAGE_FORMAT,
+        usage: wgpu::TextureUsages::TEXTURE_BINDING
+            | wgpu::TextureUsages::STORAGE_BINDING
+            | wgpu::TextureUsages::COPY_SRC,
+        view_formats: &[],
+    })
+}
+
+fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
+    let storage = |read_only| wgpu::BindingType::Buffer {
+        ty: wgpu::BufferBindingType::Storage { read_only },
+        has_dynamic_offset: false,
+        min_binding_size: None,
+    };
+    let types = [
+        wgpu::BindingType::Buffer {
+            ty: wgpu::BufferBindingType::Uniform,
+            has_dynamic_offset: true,
+            min_binding_size: wgpu::BufferSize::new(u64::from(size_u32::<FrameUniform>())),
+        },
+        storage(true),
+        storage(true),
+        storage(true),
+        storage(false),
+        storage(false),
+        storage(true),
+        wgpu::BindingType::Texture {
+            sample_type: wgpu::TextureSampleType::Float { filterable: true },
+            view_dimension: wgpu::TextureViewDimension::D3,
+            multisampled: false,
+        },
+        wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
+        wgpu::BindingType::StorageTexture {
+            access: wgpu::StorageTextureAccess::WriteOnly,
+            format: IMAGE_FORMAT,
+            view_dimension: wgpu::TextureViewDimension::D2,
+        },
+    ];
+    let entries = (0..)
+        .zip(types)
+        .map(|(binding, ty)| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty,
+            count: None,
+        });
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some("ray-caster"),
+        entries: &entries.collect::<Vec<_>>(),
+    })
+}
+
+fn pipeline(device: &wgpu::Device, layout: &wgpu::BindGroupLayout) -> wgpu::ComputePipeline {
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some("ray-caster"),
+        source: wgpu::ShaderSource::Wgsl(RAY_CAST.into()),
+    });
+    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some("ray-caster"),
+        bind_group_layouts: &[Some(layout)],
+        immediate_size: 0,
+    });
+    device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some("ray-caster"),
+        layout: Some(&layout),
+        module: &module,
+        entry_point: Some("main"),
+        compilation_options: wgpu::PipelineCompilationOptions::default(),
+        cache: None,
+    })
+}

@@ -1,0 +1,21 @@
+// Light.
+
+// Opacity of a length [nm] of a matter of some extinction [1/nm].
+fn opacity_of_length(extinction: f32, length_nm: f32) -> f32 {
+    return 1.0 - exp(-extinction * length_nm);
+}
+
+// sRGB-encoded from linear light, both in [0, 1].
+fn srgb_from_linear(linear: vec3f) -> vec3f {
+    let l = clamp(linear, vec3f(0.0), vec3f(1.0));
+    return select(1.055 * pow(l, vec3f(1.0 / 2.4)) - 0.055, l * 12.92, l <= vec3f(0.0031308));
+}
+
+// What is drawn `levels` coarser than wanted: green, then yellow, orange, red. Finer: blue.
+fn substitution_tint(levels: i32) -> vec3f {
+    if levels < 0 {
+        return vec3f(0.1, 0.3, 1.0);
+    }
+    let t = clamp(f32(levels - 1) / 3.0, 0.0, 1.0);
+    return vec3f(min(2.0 * t + 0.1, 1.0), min(2.0 - 2.0 * t, 1.0), 0.0);
+}

@@ -1,0 +1,29 @@
+// Mirrors `layout.rs`; a test compares the two.
+
+const WORKGROUP = 8u;
+const BRICK_EDGE = 32u;
+const BRICK_BORDER = 1u;
+const BRICK_STORED_EDGE = 34u;
+const MAX_LEVELS = 32u;
+const TABLE_LEN = 256u;
+
+const EMPTY = 1u;
+const FIRST_SLOT = 2u;
+const STALE = 0x80000000u;
+
+const FLAG_SUBSTITUTE = 1u;
+const FLAG_FALSE_COLORS = 2u;
+const FLAG_JITTER = 4u;
+
+const COUNTERS = 16u;
+const COUNT_MISSES = 0u;
+const COUNT_STALE = 1u;
+const COUNT_SAMPLES = 2u;
+const COUNT_LOOKUPS = 3u;
+const COUNT_SUBSTITUTED = 4u;
+const MOST_SUBSTITUTED_LEVELS = 5u;
+const FINEST_LEVEL = 6u;
+const TALLIES = 7u;
+
+const MISSES = 4096u;
+const MISSES_PER_RAY = 4u;

@@ -1,0 +1,107 @@
+// Virtual memory: from (level, brick) to a slot of the brick cache, and what was met on the way.
+
+@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(1) var<storage, read> directory: array<u32>;
+@group(0) @binding(2) var<storage, read> tables: array<u32>;
+@group(0) @binding(3) var<storage, read> slot_ranges: array<u32>;
+// A bit per physical entry: the directory's, then those of the page table cache.
+@group(0) @binding(4) var<storage, read_write> missed: array<atomic<u32>>;
+// Counters; a bit per brick slot, then per page table block, in use; (entry, urgency) of misses.
+@group(0) @binding(5) var<storage, read_write> report: array<atomic<u32>>;
+
+// Where the way to a brick ended.
+struct Found {
+    entry: u32,     // without its stale bit
+    stale: bool,
+    physical: u32,  // number of the entry
+    span_log2: u32, // edge of what lies under the entry [log2 of bricks]
+}
+
+// The page table block used last, at the last step: most bricks along a ray share it.
+var<private> last_level: u32 = 0xffffffffu;
+var<private> last_block: vec3u;
+var<private> last_first: u32;
+
+var<private> lookups: u32;
+var<private> misses_left: u32 = MISSES_PER_RAY;
+
+fn mark_used(slot: u32) {
+    let word = COUNTERS + slot / 32u;
+    let bit = 1u << (slot % 32u);
+    // Most bits are set already; reading is cheaper than writing.
+    if (atomicLoad(&report[word]) & bit) == 0u {
+        atomicOr(&report[word], bit);
+    }
+}
+
+fn mark_brick_used(slot: u32) {
+    mark_used(slot);
+}
+
+fn mark_block_used(block: u32) {
+    let bricks = frame.brick_grid.x * frame.brick_grid.y * frame.brick_grid.z;
+    mark_used(bricks + block);
+}
+
+// Reports an entry once a frame. A small `urgency` is urgent.
+fn mark_missed(found: Found, urgency: f32) {
+    if misses_left == 0u {
+        return;
+    }
+    misses_left -= 1u;
+    let word = found.physical / 32u;
+    let bit = 1u << (found.physical % 32u);
+    if (atomicLoad(&missed[word]) & bit) != 0u || (atomicOr(&missed[word], bit) & bit) != 0u {
+        return;
+    }
+    if found.stale {
+        atomicAdd(&report[COUNT_STALE], 1u);
+    }
+    let n = atomicAdd(&report[COUNT_MISSES], 1u);
+    if n < MISSES {
+        let at = COUNTERS + frame.usage_words + 2u * n;
+        atomicStore(&report[at], found.physical);
+        atomicStore(&report[at + 1u], bitcast<u32>(max(urgency, 0.0)));
+    }
+}
+
+fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
+    return Found(value & ~STALE, (value & STALE) != 0u, physical, span_log2);
+}
+
+fn find(level: u32, brick: vec3u) -> Found {
+    lookups += 1u;
+    let edge = frame.block_edge_log2;
+    let inside = vec3u((1u << edge) - 1u);
+    let block_at = brick >> vec3u(edge);
+    if level == last_level && all(block_at == last_block) {
+        let at = brick & inside;
+        let entry = last_first + ((((at.z << edge) + at.y) << edge) + at.x);
+        return found_at(tables[entry], frame.directory_entries + entry, 0u);
+    }
+    var span = edge * (frame.depth - 1u);
+    let size = frame.levels[level].directory;
+    let cell = brick >> vec3u(span);
+    var physical = frame.levels[level].directory_base + (cell.z * size.y + cell.y) * size.x + cell.x;
+    var value = directory[physical];
+    loop {
+        let slot = value & ~STALE;
+        if span == 0u || slot < FIRST_SLOT {
+            break;
+        }
+        let block = slot - FIRST_SLOT;
+        mark_block_used(block);
+        span -= edge;
+        let at = (brick >> vec3u(span)) & inside;
+        let first = block << (3u * edge);
+        let entry = first + ((((at.z << edge) + at.y) << edge) + at.x);
+        physical = frame.directory_entries + entry;
+        value = tables[entry];
+        if span == 0u {
+            last_level = level;
+            last_block = block_at;
+            last_first = first;
+        }
+    }
+    return found_at(value, physical, span);
+}

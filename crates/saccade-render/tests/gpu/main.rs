@@ -1,0 +1,10 @@
+//! Pictures against a brute-force ray-caster, and the caches at work, on whatever GPU there is.
+//!
+//! Without an adapter these tests print so and pass; `SACCADE_GPU_TESTS=require` makes that a
+//! failure. `SACCADE_GPU_TEST_IMAGES=DIR` keeps the pictures.
+
+mod behaviour;
+mod harness;
+mod oracle;
+mod pictures;
+mod scene;

@@ -1,0 +1,99 @@
+//! Against the oracle.
+
+use glam::{DVec3, UVec2};
+use saccade_core::camera::Camera;
+use saccade_core::page_table::PageTableShape;
+use saccade_core::space::Point;
+use saccade_core::transfer::ColorMap;
+use saccade_core::volume::Polarity;
+use saccade_render::{Image, Renderer, RendererOptions, View};
+
+use crate::harness::{gpu, keep, psnr, read, settle};
+use crate::oracle::{self, Cut};
+use crate::scene::{Scene, ramp, tissue, waves};
+
+/// A picture counts as the oracle's from here on \[dB\].
+const SAME: f64 = 45.0;
+const SIZE: UVec2 = UVec2::new(72, 56);
+
+fn cameras(scene: &Scene) -> Vec<(&'static str, Camera)> {
+    let around = Camera::around(&scene.volume);
+    let middle = scene.volume.size_nm() / 2.0;
+    let front = Camera {
+        yaw: 0.0,
+        pitch: 0.0,
+        ..around
+    };
+    let inside = Camera {
+        distance_nm: 1e-3,
+        target: Point::new(middle * 0.9),
+        ..around
+    };
+    vec![
+        ("corner", around),
+        ("front", front),
+        (
+            "above",
+            Camera {
+                pitch: 88.0,
+                ..around
+            },
+        ),
+        (
+            "side",
+            Camera {
+                yaw: 90.0,
+                pitch: 0.0,
+                ..around
+            },
+        ),
+        ("near", around.zoomed(4.0)),
+        ("far", around.zoomed(0.2)),
+        ("inside", inside),
+        (
+            "behind",
+            Camera {
+                target: Point::new(middle - DVec3::Z * 1e5),
+                yaw: 180.0,
+                ..front
+            },
+        ),
+    ]
+}
+
+fn picture(scene: &Scene, view: &View, options: RendererOptions) -> Option<Image> {
+    let gpu = gpu()?;
+    let mut renderer = Renderer::new(&gpu, scene.volume.clone(), options).unwrap();
+    renderer.set_transfer_function(&scene.transfer);
+    let reports = settle(&mut renderer, view, scene);
+    assert!(reports.last().unwrap().is_complete());
+    Some(read(&renderer))
+}
+
+fn compare(name: &str, scene: &Scene) {
+    for (camera_name, camera) in cameras(scene) {
+        let view = View {
+            background: [0.1, 0.2, 0.4],
+            ..View::new(camera, SIZE)
+        };
+        let Some(got) = picture(scene, &view, RendererOptions::default()) else {
+            return;
+        };
+        let want = oracle::render(scene, &view, Cut::HalfVoxels);
+        let name = format!("{name}-{camera_name}");
+        keep(&format!("{name}-gpu"), &got);
+        keep(&format!("{name}-oracle"), &want);
+        let db = psnr(&got, &want);
+        assert!(db >= SAME, "{name}: {db:.1} dB");
+    }
+}
+
+#[test]
+fn waves_look_as_the_oracle_says() {
+    compare("waves", &waves());
+}
+
+#[test]
+fn tissue_looks_as_the_oracle_says() {
+    compare("tissue", &tissue());
+}

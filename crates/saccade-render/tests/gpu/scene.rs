@@ -1,0 +1,166 @@
+//! Volumes as plain arrays, one per level.
+
+use std::sync::Arc;
+
+use glam::{DVec3, UVec3};
+use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
+use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
+use saccade_core::volume::{Polarity, Volume};
+use saccade_core::voxel_box::VoxelBox;
+
+/// All levels of a volume, in main memory.
+pub(crate) struct Scene {
+    pub(crate) volume: Arc<Volume>,
+    /// Per level, x fastest.
+    pub(crate) levels: Vec<Vec<u8>>,
+    pub(crate) transfer: TransferFunction,
+}
+
+impl Scene {
+    pub(crate) fn new(
+        extent: UVec3,
+        voxel_nm: DVec3,
+        transfer: TransferFunction,
+        value: impl Fn(DVec3) -> f64,
+    ) -> Self {
+        let volume = Volume::new("scene", extent, voxel_nm).unwrap();
+        let finest = VoxelBox::of_size(extent).iter().map(|voxel| {
+            let nm = (voxel.as_dvec3() + 0.5) * voxel_nm;
+            value(nm).round().clamp(0.0, 255.0) as u8
+        });
+        let mut levels = vec![finest.collect::<Vec<u8>>()];
+        for level in &volume.levels[1..] {
+            let down = level.downsampling.as_uvec3();
+            let average = |voxel: UVec3| {
+                let covered = VoxelBox::new(voxel * down, (voxel + 1) * down);
+                let covered = covered.intersection(VoxelBox::of_size(extent));
+                let sum: u64 = covered
+                    .iter()
+                    .map(|v| u64::from(levels[0][flat(v, extent)]))
+                    .sum();
+                ((sum + covered.voxels() / 2) / covered.voxels()) as u8
+            };
+            let coarser = VoxelBox::of_size(level.extent)
+                .iter()
+                .map(average)
+                .collect();
+            levels.push(coarser);
+        }
+        Self {
+            volume: Arc::new(volume),
+            levels,
+            transfer,
+        }
+    }
+
+    /// Stored value of a voxel of a level; 0 outside.
+    pub(crate) fn stored(&self, level: usize, voxel: [i64; 3]) -> u8 {
+        let extent = self.volume.levels[level].extent;
+        let inside = (0..3).all(|a| (0..i64::from(extent[a])).contains(&voxel[a]));
+        if !inside {
+            return 0;
+        }
+        let voxel = UVec3::from_array(voxel.map(|v| u32::try_from(v).unwrap()));
+        self.transfer
+            .polarity
+            .stored(self.levels[level][flat(voxel, extent)])
+    }
+
+    /// A brick with its border, as a source delivers it; `None` where nothing was acquired.
+    pub(crate) fn brick(&self, id: BrickId) -> Option<Vec<u8>> {
+        let level = id.level() as usize;
+        let low = (id.brick() * BRICK_EDGE).as_i64vec3() - i64::from(BRICK_BORDER);
+        let voxels = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE))
+            .iter()
+            .map(|offset| {
+                let stored = self.stored(level, (low + offset.as_i64vec3()).to_array());
+                self.transfer.polarity.stored(stored)
+            });
+        let voxels: Vec<u8> = voxels.collect();
+        voxels.iter().any(|&v| v != 0).then_some(voxels)
+    }
+}
+
+fn flat(voxel: UVec3, extent: UVec3) -> usize {
+    ((voxel.z * extent.y + voxel.y) * extent.x + voxel.x) as usize
+}
+
+/// A ramp of opacity over the values, in grey or colour.
+pub(crate) fn ramp(
+    polarity: Polarity,
+    color_map: ColorMap,
+    points: &[(f32, f32)],
+    nm: f64,
+) -> TransferFunction {
+    let point = |&(value, opacity): &(f32, f32)| OpacityPoint { value, opacity };
+    TransferFunction {
+        polarity,
+        color_map,
+        window: [0.0, 1.0],
+        opacity: points.iter().map(point).collect(),
+        opacity_length_nm: nm,
+    }
+}
+
+/// Smooth waves, in odd sizes and voxels five times as thick as wide.
+pub(crate) fn waves() -> Scene {
+    let transfer = ramp(
+        Polarity::Bright,
+        ColorMap::Gray,
+        &[(0.3, 0.0), (0.8, 0.7)],
+        40.0,
+    );
+    Scene::new(
+        UVec3::new(61, 47, 33),
+        DVec3::new(4.0, 4.0, 20.0),
+        transfer,
+        |nm| {
+            let wave = (nm.x / 31.0).sin()
+                + (nm.y / 23.0 + 1.0).cos()
+                + (nm.z / 97.0 + nm.x / 200.0).sin();
+            128.0 + 40.0 * wave
+        },
+    )
+}
+
+/// Bright cells with dark walls and dark spots, as electron microscopy shows tissue; a corner is
+/// not acquired yet.
+pub(crate) fn tissue() -> Scene {
+    let transfer = ramp(
+        Polarity::Dark,
+        ColorMap::Gray,
+        &[(0.1, 0.9), (0.45, 0.0)],
+        16.0,
+    );
+    let size = DVec3::new(151.0 * 4.0, 133.0 * 4.0, 21.0 * 20.0);
+    let seeds: Vec<DVec3> = (0..40).map(|n| halton(n) * size).collect();
+    Scene::new(
+        UVec3::new(151, 133, 21),
+        DVec3::new(4.0, 4.0, 20.0),
+        transfer,
+        move |nm| {
+            if nm.x > size.x * 0.7 && nm.y < size.y * 0.4 {
+                return 0.0;
+            }
+            let mut distances: Vec<f64> = seeds.iter().map(|s| s.distance(nm)).collect();
+            distances.sort_by(f64::total_cmp);
+            let wall = ((distances[1] - distances[0]) / 12.0).min(1.0);
+            let spot = ((distances[0] - 14.0) / 8.0).clamp(0.0, 1.0);
+            1.0 + 220.0 * wall * (0.4 + 0.6 * spot)
+        },
+    )
+}
+
+/// Points that fill the unit cube evenly.
+fn halton(n: u32) -> DVec3 {
+    let radical = |base: u32| {
+        let (mut value, mut scale, mut rest) = (0.0, 1.0, n + 1);
+        while rest > 0 {
+            scale /= f64::from(base);
+            value += scale * f64::from(rest % base);
+            rest /= base;
+        }
+        value
+    };
+    DVec3::new(radical(2), radical(3), radical(5))
+}
