@@ -1,2 +1,61 @@
-//! The command line.
-fn main() {}
+//! The command line. `saccade help` lists the commands.
+//!
+//! Everything happens in the rooms below; see the README of this crate for its one rule.
+
+mod arguments;
+mod commands;
+mod interrupt;
+mod open;
+mod progress;
+mod report;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Look into a microscope's volume while it is still being acquired.
+#[derive(Parser)]
+#[command(version, arg_required_else_help = true)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Demo(commands::demo::Demo),
+    Simulate(commands::simulate::Simulate),
+    Ingest(commands::ingest::Ingest),
+    Serve(commands::serve::Serve),
+    View(commands::view::View),
+    Render(commands::render::Render),
+}
+
+fn main() -> ExitCode {
+    // Prints usage errors itself, and ends with 2.
+    let CommandLine { command } = CommandLine::parse();
+    report::log_to_stderr();
+    let runtime = match tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+    {
+        Ok(runtime) => runtime,
+        Err(error) => return report::failed(&error.into()),
+    };
+    let done = runtime.block_on(async {
+        match command {
+            Command::Demo(demo) => demo.run().await,
+            Command::Simulate(simulate) => simulate.run().await,
+            Command::Ingest(ingest) => ingest.run().await,
+            Command::Serve(serve) => serve.run().await,
+            Command::View(view) => view.run().await,
+            Command::Render(render) => render.run().await,
+        }
+    });
+    // Work on other threads that nobody waits for any more must not keep the program alive.
+    runtime.shutdown_background();
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => report::failed(&error),
+    }
+}

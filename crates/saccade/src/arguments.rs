@@ -1,0 +1,101 @@
+//! Values on the command line.
+
+use glam::{DVec3, UVec2, UVec3};
+
+/// Three whole numbers above 0, as `x,y,z`.
+pub(crate) fn extent(text: &str) -> Result<UVec3, String> {
+    let [x, y, z] = numbers(text, ',').ok_or("give three whole numbers as x,y,z")?;
+    positive(
+        UVec3::new(x, y, z),
+        UVec3::min_element,
+        "every axis needs at least one voxel",
+    )
+}
+
+/// Nanometres per voxel, as `x,y,z` or one number for all axes.
+pub(crate) fn voxel_nm(text: &str) -> Result<DVec3, String> {
+    let nm = match numbers(text, ',') {
+        Some([x, y, z]) => DVec3::new(x, y, z),
+        None => match text.trim().parse() {
+            Ok(all) => DVec3::splat(all),
+            Err(_) => return Err("give nanometres as x,y,z".into()),
+        },
+    };
+    let sensible = nm.is_finite() && nm.min_element() > 0.0;
+    sensible
+        .then_some(nm)
+        .ok_or_else(|| "voxel sizes must be above 0".into())
+}
+
+/// Width and height above 0, as `WxH`.
+pub(crate) fn size(text: &str) -> Result<UVec2, String> {
+    let [x, y] = numbers(text, 'x').ok_or("give width and height as WxH, such as 1280x720")?;
+    positive(
+        UVec2::new(x, y),
+        UVec2::min_element,
+        "width and height must be above 0",
+    )
+}
+
+/// A time in seconds.
+pub(crate) fn seconds(text: &str) -> Result<std::time::Duration, String> {
+    let seconds: f64 = text
+        .parse()
+        .map_err(|_| "give seconds, such as 30 or 0.5")?;
+    std::time::Duration::try_from_secs_f64(seconds).map_err(|error| error.to_string())
+}
+
+/// A rate in Mpixel/s above 0; `None` for `max`.
+pub(crate) fn rate(text: &str) -> Result<Rate, String> {
+    if text == "max" {
+        return Ok(Rate(None));
+    }
+    let rate: f64 = text
+        .parse()
+        .map_err(|_| "give Mpixel/s, such as 10, or max")?;
+    let sensible = rate.is_finite() && rate > 0.0;
+    sensible
+        .then_some(Rate(Some(rate)))
+        .ok_or_else(|| "rates must be above 0, or max".into())
+}
+
+/// Mpixel/s; `None`: as fast as possible.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Rate(pub(crate) Option<f64>);
+
+fn numbers<T: std::str::FromStr, const N: usize>(text: &str, separator: char) -> Option<[T; N]> {
+    let parts: Result<Vec<T>, _> = text.split(separator).map(|n| n.trim().parse()).collect();
+    parts.ok()?.try_into().ok()
+}
+
+fn positive<T: Copy>(value: T, smallest: fn(T) -> u32, must: &str) -> Result<T, String> {
+    if smallest(value) > 0 {
+        Ok(value)
+    } else {
+        Err(must.to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_read_or_refused() {
+        assert_eq!(extent("3, 4,5"), Ok(UVec3::new(3, 4, 5)));
+        assert_eq!(size("640x480"), Ok(UVec2::new(640, 480)));
+        assert_eq!(voxel_nm("4,4,40"), Ok(DVec3::new(4.0, 4.0, 40.0)));
+        assert_eq!(voxel_nm("8"), Ok(DVec3::splat(8.0)));
+        assert_eq!(
+            (rate("2.5"), rate("max")),
+            (Ok(Rate(Some(2.5))), Ok(Rate(None)))
+        );
+        for bad in ["", "3,4", "3,4,5,6", "0,1,1", "-1,2,3", "1.5,1,1", "a,b,c"] {
+            assert!(extent(bad).is_err(), "{bad}");
+        }
+        assert!(size("0x4").is_err() && size("64").is_err() && size("64x64x64").is_err());
+        assert!(voxel_nm("4,4,0").is_err() && voxel_nm("4,nan,4").is_err());
+        assert!(rate("0").is_err() && rate("-1").is_err() && rate("fast").is_err());
+        assert!(seconds("-1").is_err() && seconds("soon").is_err() && seconds("0.5").is_ok());
+    }
+}

@@ -1,0 +1,9 @@
+//! One module per subcommand.
+
+pub(crate) mod demo;
+pub(crate) mod ingest;
+pub(crate) mod render;
+pub(crate) mod serve;
+pub(crate) mod simulate;
+mod subject;
+pub(crate) mod view;

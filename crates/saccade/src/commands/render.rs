@@ -1,0 +1,157 @@
+//! `saccade render`: a picture without a window.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use clap::Args;
+use glam::UVec2;
+use saccade_core::camera::Camera;
+use saccade_core::transfer::TransferFunction;
+use saccade_render::{Gpu, View};
+use saccade_stream::{Session, SessionOptions, SettleError, Status};
+use saccade_view::background_from_text;
+
+use crate::arguments::{seconds, size};
+use crate::open::Place;
+use crate::report::tell;
+
+/// Draw a volume into a PNG file. Waits until the picture is complete.
+#[derive(Args)]
+pub(crate) struct Render {
+    /// Address of a server, or folder of a visualization archive
+    #[arg(value_name = "URL|ARCHIVE")]
+    place: Place,
+
+    /// The picture to write
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+
+    /// Name of the volume; the first otherwise
+    #[arg(long)]
+    volume: Option<String>,
+
+    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres; the whole volume
+    /// otherwise
+    #[arg(long, allow_hyphen_values = true)]
+    camera: Option<Camera>,
+
+    /// Size of the picture [pixels]
+    #[arg(long, value_name = "WxH", value_parser = size, default_value = "1280x720")]
+    size: UVec2,
+
+    /// Colours and opacities: auto, a JSON file, or JSON itself
+    #[arg(long, value_name = "JSON", default_value = "auto")]
+    transfer: String,
+
+    /// Behind everything, as #rrggbb
+    #[arg(long, value_name = "COLOUR", value_parser = background_from_text, default_value = "#000000")]
+    background: [f32; 3],
+
+    /// Levels coarser (above 0) or finer (below) than one voxel a pixel
+    #[arg(
+        long,
+        value_name = "LEVELS",
+        default_value_t = 0.0,
+        allow_hyphen_values = true
+    )]
+    lod_bias: f32,
+
+    /// Ceiling for GPU memory [MiB]
+    #[arg(long, value_name = "MIB", default_value_t = 512)]
+    gpu_memory: u32,
+
+    /// How long to wait for the picture to be complete [s]
+    #[arg(long, value_name = "SECONDS", value_parser = seconds, default_value = "60")]
+    timeout: Duration,
+
+    /// Write the picture even if it is not complete by then
+    #[arg(long)]
+    partial: bool,
+}
+
+impl Render {
+    pub(crate) async fn run(self) -> Result<()> {
+        let transfer = self.transfer_function()?;
+        let source = self.place.open(self.volume.as_deref()).await?.source;
+        let gpu = Gpu::headless().await?;
+        let gpu_bytes = u64::from(self.gpu_memory) << 20;
+        let options = SessionOptions {
+            gpu_bytes,
+            ..SessionOptions::default()
+        };
+        let camera = self
+            .camera
+            .unwrap_or_else(|| Camera::around(source.volume()));
+        let mut session = Session::new(&gpu, source, options)?;
+        if let Some(transfer) = transfer {
+            session.set_transfer_function(transfer);
+        }
+        let view = View {
+            background: self.background,
+            lod_bias: self.lod_bias,
+            ..View::new(camera, self.size)
+        };
+        let status = match session.settle(&view, self.timeout).await {
+            Ok(status) => status,
+            Err(SettleError::Timeout { status, .. } | SettleError::Failed { status })
+                if self.partial =>
+            {
+                *status
+            }
+            Err(error) => {
+                return Err(error).context(
+                    "the picture is not complete and was not written; --timeout waits longer, \
+                     --partial takes it as it is",
+                );
+            }
+        };
+        let picture = session.renderer().read_pixels().await?;
+        image::save_buffer_with_format(
+            &self.output,
+            &picture.rgba,
+            picture.size.x,
+            picture.size.y,
+            image::ExtendedColorType::Rgba8,
+            image::ImageFormat::Png,
+        )
+        .with_context(|| format!("cannot write the picture {}", self.output.display()))?;
+        tell(&fidelity(&status));
+        Ok(())
+    }
+
+    /// `None` for the automatic one.
+    fn transfer_function(&self) -> Result<Option<TransferFunction>> {
+        if self.transfer == "auto" {
+            return Ok(None);
+        }
+        let inline = self.transfer.trim_start().starts_with('{');
+        let (json, place) = if inline {
+            (self.transfer.clone(), "--transfer".to_owned())
+        } else {
+            let json = std::fs::read_to_string(&self.transfer)
+                .with_context(|| format!("cannot read the transfer function {}", self.transfer))?;
+            (json, self.transfer.clone())
+        };
+        let transfer = serde_json::from_str(&json)
+            .with_context(|| format!("this is no transfer function as JSON: {place}"))?;
+        Ok(Some(transfer))
+    }
+}
+
+/// How true the picture is, on one line.
+fn fidelity(status: &Status) -> String {
+    let level = match status.fidelity.level {
+        Some(level) => format!("level {level}"),
+        None => "nothing of the volume in view".to_owned(),
+    };
+    if status.complete {
+        format!("complete, {level}, revision {}", status.revision)
+    } else {
+        let missing = status.fidelity.missing;
+        format!(
+            "{missing} bricks missing, {level}, revision {}",
+            status.revision
+        )
+    }
+}

@@ -1,0 +1,64 @@
+//! `saccade serve`: an archive over HTTP.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Result;
+use clap::Args;
+use saccade_archive::VisualizationArchive;
+use saccade_serve::{Options, Server, Volumes, follow_archive, offer_archive};
+use saccade_source::stitched::StitchedOptions;
+
+use crate::interrupt::interrupted;
+use crate::report::{say, tell};
+
+/// Offer the volumes of an archive over HTTP, with the browser application.
+#[derive(Args)]
+pub(crate) struct Serve {
+    /// Folder of the visualization archive
+    archive: PathBuf,
+
+    #[command(flatten)]
+    at: At,
+}
+
+/// Where to listen.
+#[derive(Args)]
+pub(crate) struct At {
+    /// Address to listen on; 0.0.0.0 lets other computers in
+    #[arg(long, value_name = "ADDRESS", default_value_t = IpAddr::V4(Ipv4Addr::LOCALHOST))]
+    host: IpAddr,
+
+    /// Port to listen on; 0 for any free one
+    #[arg(long, default_value_t = 8080)]
+    port: u16,
+}
+
+impl At {
+    pub(crate) fn address(&self) -> SocketAddr {
+        SocketAddr::new(self.host, self.port)
+    }
+}
+
+/// Between looks for new volumes.
+const POLL: Duration = Duration::from_secs(2);
+
+impl Serve {
+    pub(crate) async fn run(self) -> Result<()> {
+        let archive = VisualizationArchive::open(&self.archive).await?;
+        let server = Server::bind(self.at.address()).await?;
+        let volumes = Volumes::new();
+        let options = StitchedOptions::default();
+        if offer_archive(&volumes, &archive, options).await?.is_empty() {
+            say("the archive holds no volumes yet; they are offered as they appear");
+        }
+        tell(&server.url());
+        let follow = follow_archive(&volumes, &archive, options, POLL);
+        tokio::select! {
+            served = server.run(volumes.clone(), Options::DEFAULT, interrupted()) => served?,
+            () = follow => {}
+        }
+        Ok(())
+    }
+}

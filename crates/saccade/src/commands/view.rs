@@ -1,0 +1,55 @@
+//! `saccade view`: the application in a window.
+
+use anyhow::Result;
+use clap::Args;
+use saccade_core::camera::Camera;
+use saccade_view::{SourceSpec, ViewOptions, background_from_text, run};
+
+use crate::open::{Opened, Place};
+
+/// Look at a volume in a window of its own.
+#[derive(Args)]
+pub(crate) struct View {
+    /// Address of a server, or folder of a visualization archive
+    #[arg(value_name = "URL|ARCHIVE")]
+    place: Place,
+
+    /// Name of the volume; the first otherwise
+    #[arg(long)]
+    volume: Option<String>,
+
+    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres
+    #[arg(long, allow_hyphen_values = true)]
+    camera: Option<Camera>,
+
+    /// Behind everything, as #rrggbb
+    #[arg(long, value_name = "COLOUR", value_parser = background_from_text, default_value = "#000000")]
+    background: [f32; 3],
+
+    /// Ceiling for GPU memory [MiB]
+    #[arg(long, value_name = "MIB", default_value_t = 512)]
+    gpu_memory: u32,
+}
+
+impl View {
+    pub(crate) async fn run(self) -> Result<()> {
+        let Opened {
+            source,
+            acquisition,
+        } = self.place.open(self.volume.as_deref()).await?;
+        let options = ViewOptions {
+            camera: self.camera,
+            background: self.background,
+            gpu_bytes: u64::from(self.gpu_memory) << 20,
+            ..ViewOptions::default()
+        };
+        Ok(run(
+            SourceSpec::Open {
+                source,
+                acquisition,
+            },
+            options,
+        )
+        .await?)
+    }
+}

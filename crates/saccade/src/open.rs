@@ -1,0 +1,108 @@
+//! Volumes that the command line names: of a server or of an archive.
+
+use std::convert::Infallible;
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use saccade_archive::VisualizationArchive;
+use saccade_serve::{CatalogStatus, StatusSource};
+use saccade_source::VolumeSource;
+use saccade_source::remote::{Quarantined, RemoteSource, Status, volumes};
+use saccade_source::stitched::{StitchedOptions, StitchedSource};
+use saccade_view::AcquisitionReader;
+
+/// Where a volume is.
+#[derive(Clone, Debug)]
+pub(crate) enum Place {
+    /// The address of a server.
+    Server(String),
+    /// The folder of a visualization archive.
+    Archive(PathBuf),
+}
+
+impl FromStr for Place {
+    type Err = Infallible;
+    fn from_str(text: &str) -> Result<Self, Infallible> {
+        let server = text.starts_with("http://") || text.starts_with("https://");
+        Ok(if server {
+            Self::Server(text.to_owned())
+        } else {
+            Self::Archive(text.into())
+        })
+    }
+}
+
+/// An open volume, and who knows how its acquisition is coming along.
+pub(crate) struct Opened {
+    pub(crate) source: Arc<dyn VolumeSource>,
+    pub(crate) acquisition: Option<AcquisitionReader>,
+}
+
+impl Place {
+    /// Opens the volume of that name, or the first.
+    pub(crate) async fn open(&self, name: Option<&str>) -> Result<Opened> {
+        match self {
+            Self::Server(address) => {
+                let name = match name {
+                    Some(name) => name.to_owned(),
+                    None => match volumes(address).await?.into_iter().next() {
+                        Some(name) => name,
+                        None => bail!("the server offers no volumes yet: {address}"),
+                    },
+                };
+                let source = RemoteSource::open(address, &name).await?;
+                let reader = source.status_reader();
+                let acquisition: AcquisitionReader = Arc::new(move || {
+                    let reader = reader.clone();
+                    Box::pin(async move { reader.read().await.ok() })
+                });
+                Ok(Opened {
+                    source: Arc::new(source),
+                    acquisition: Some(acquisition),
+                })
+            }
+            Self::Archive(folder) => {
+                let archive = VisualizationArchive::open(folder).await?;
+                let name = match name {
+                    Some(name) => name.to_owned(),
+                    None => match archive.catalog().volumes().await?.into_iter().next() {
+                        Some(entry) => entry.volume.name,
+                        None => bail!(
+                            "the archive holds no volumes yet; `saccade ingest` fills it: {}",
+                            folder.display()
+                        ),
+                    },
+                };
+                let options = StitchedOptions::default();
+                let source = StitchedSource::open(&archive, &name, options)
+                    .await
+                    .with_context(|| format!("cannot open a volume of {}", folder.display()))?;
+                let status = CatalogStatus::new(archive.catalog().clone(), &name);
+                let acquisition: AcquisitionReader = Arc::new(move || {
+                    let status = status.clone();
+                    Box::pin(async move { status.status().await.ok().map(told) })
+                });
+                Ok(Opened {
+                    source: Arc::new(source),
+                    acquisition: Some(acquisition),
+                })
+            }
+        }
+    }
+}
+
+/// What a server would have told.
+fn told(status: saccade_serve::Status) -> Status {
+    let file = |q: saccade_serve::Quarantined| Quarantined {
+        file: q.file,
+        reason: q.reason,
+    };
+    Status {
+        revision: status.revision,
+        tiles: status.tiles,
+        sections: status.sections,
+        quarantined: status.quarantined.into_iter().map(file).collect(),
+    }
+}
