@@ -1,7 +1,9 @@
 //! The device everything is drawn with.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
+
+use crate::ray_caster::RayCaster;
 
 /// A device and its queue, with error and loss handlers installed. Cloning shares them.
 #[derive(Clone, Debug)]
@@ -10,6 +12,7 @@ pub struct Gpu {
     queue: wgpu::Queue,
     adapter: wgpu::AdapterInfo,
     lost: Arc<AtomicBool>,
+    ray_caster: Arc<OnceLock<RayCaster>>,
 }
 
 /// There is no device to draw with.
@@ -108,6 +111,7 @@ impl Gpu {
             queue,
             adapter,
             lost,
+            ray_caster: Arc::default(),
         }
     }
 
@@ -129,5 +133,9 @@ impl Gpu {
     /// Whether the device is gone, and everything made with it.
     pub fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Acquire)
+    }
+
+    pub(crate) fn ray_caster(&self) -> &RayCaster {
+        self.ray_caster.get_or_init(|| RayCaster::new(&self.device))
     }
 }

@@ -5,6 +5,7 @@ mod gpu;
 mod image;
 mod layout;
 mod memory;
+mod ray_caster;
 mod readback;
 mod renderer;
 mod report;

@@ -459,12 +459,13 @@ impl Renderer {
         let used = used.max(share(blocks_used, memory.table_slots));
         let fidelity = report.fidelity();
         let next = self.memory.next_frame();
-        self.pressure
-            .report(frame, next, fidelity.missing == 0, used);
+        let complete = fidelity.missing == 0;
+        let bias_moves = self.pressure.report(frame, next, complete, used);
         FrameReport {
             frame,
             misses,
             fidelity,
+            redraw: bias_moves || tables_made > 0,
             lod_bias: 0.0,
             memory_bias: 0.0,
             statistics: report.statistics(bricks_used, blocks_used),

@@ -14,10 +14,13 @@ pub struct FrameReport {
     pub frame: u64,
     /// Bricks the frame wanted and that are still not there, most wanted first.
     ///
-    /// May be empty while the frame is incomplete: the next one will know more.
+    /// May be empty while the frame is incomplete; the next one will know more ([`Self::redraw`]).
     pub misses: Vec<BrickId>,
     /// How true the picture is.
     pub fidelity: Fidelity,
+    /// Another frame of the same view will be different, even if nothing is delivered until then:
+    /// page tables were added, or the level of detail is about to change.
+    pub redraw: bool,
     /// Level-of-detail bias in force: the view's plus what memory asked for.
     pub lod_bias: f32,
     /// Part of `lod_bias` that was added because the bricks of the view do not fit the memory.

@@ -1,17 +1,15 @@
-//! Everything on the device: caches, buffers, the pipeline.
+//! What a renderer has on the device: caches, buffers, the picture.
 
 use glam::{UVec2, UVec3};
 use saccade_core::brick::BRICK_STORED_EDGE;
 
 use crate::gpu::Gpu;
-use crate::layout::{FrameUniform, RAY_CAST, TransferStorage, WORKGROUP};
+use crate::layout::{FrameUniform, TransferStorage, WORKGROUP};
 use crate::memory::plan::Plan;
 use crate::memory::{Array, Entry};
+use crate::ray_caster::IMAGE_FORMAT;
 
-/// Format of the picture: portable for storage, read as it is by windows.
-pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
-
-/// Everything on the device.
+/// Caches and buffers of one volume.
 #[derive(Debug)]
 pub(crate) struct Resources {
     frames: wgpu::Buffer,
@@ -25,8 +23,6 @@ pub(crate) struct Resources {
     bricks: wgpu::Texture,
     brick_grid: UVec3,
     sampler: wgpu::Sampler,
-    pipeline: wgpu::ComputePipeline,
-    layout: wgpu::BindGroupLayout,
 }
 
 /// Where a frame is drawn.
@@ -81,8 +77,6 @@ impl Resources {
             min_filter: wgpu::FilterMode::Linear,
             ..Default::default()
         });
-        let layout = bind_group_layout(device);
-        let pipeline = pipeline(device, &layout);
         Self {
             frames,
             frame_stride,
@@ -95,8 +89,6 @@ impl Resources {
             bricks,
             brick_grid: plan.brick_grid,
             sampler,
-            pipeline,
-            layout,
         }
     }
 
@@ -128,7 +120,7 @@ impl Resources {
         let entries = entries.map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource });
         let bind_group = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("ray-caster"),
-            layout: &self.layout,
+            layout: &gpu.ray_caster().layout,
             entries: &entries.collect::<Vec<_>>(),
         });
         Picture {
@@ -212,7 +204,7 @@ impl Resources {
                     label: Some("ray-caster"),
                     timestamp_writes: None,
                 });
-                pass.set_pipeline(&self.pipeline);
+                pass.set_pipeline(&gpu.ray_caster().pipeline);
                 pass.set_bind_group(0, &picture.bind_group, &[band * self.frame_stride]);
                 let rows = per_band.min(groups.y - band * per_band);
                 pass.dispatch_workgroups(groups.x, rows, 1);
@@ -264,69 +256,5 @@ fn image_texture(device: &wgpu::Device, size: UVec2) -> wgpu::Texture {
             | wgpu::TextureUsages::STORAGE_BINDING
             | wgpu::TextureUsages::COPY_SRC,
         view_formats: &[],
-    })
-}
-
-fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
-    let storage = |read_only| wgpu::BindingType::Buffer {
-        ty: wgpu::BufferBindingType::Storage { read_only },
-        has_dynamic_offset: false,
-        min_binding_size: None,
-    };
-    let types = [
-        wgpu::BindingType::Buffer {
-            ty: wgpu::BufferBindingType::Uniform,
-            has_dynamic_offset: true,
-            min_binding_size: wgpu::BufferSize::new(u64::from(size_u32::<FrameUniform>())),
-        },
-        storage(true),
-        storage(true),
-        storage(true),
-        storage(false),
-        storage(false),
-        storage(true),
-        wgpu::BindingType::Texture {
-            sample_type: wgpu::TextureSampleType::Float { filterable: true },
-            view_dimension: wgpu::TextureViewDimension::D3,
-            multisampled: false,
-        },
-        wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
-        wgpu::BindingType::StorageTexture {
-            access: wgpu::StorageTextureAccess::WriteOnly,
-            format: IMAGE_FORMAT,
-            view_dimension: wgpu::TextureViewDimension::D2,
-        },
-    ];
-    let entries = (0..)
-        .zip(types)
-        .map(|(binding, ty)| wgpu::BindGroupLayoutEntry {
-            binding,
-            visibility: wgpu::ShaderStages::COMPUTE,
-            ty,
-            count: None,
-        });
-    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-        label: Some("ray-caster"),
-        entries: &entries.collect::<Vec<_>>(),
-    })
-}
-
-fn pipeline(device: &wgpu::Device, layout: &wgpu::BindGroupLayout) -> wgpu::ComputePipeline {
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some("ray-caster"),
-        source: wgpu::ShaderSource::Wgsl(RAY_CAST.into()),
-    });
-    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: Some("ray-caster"),
-        bind_group_layouts: &[Some(layout)],
-        immediate_size: 0,
-    });
-    device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-        label: Some("ray-caster"),
-        layout: Some(&layout),
-        module: &module,
-        entry_point: Some("main"),
-        compilation_options: wgpu::PipelineCompilationOptions::default(),
-        cache: None,
     })
 }

@@ -6,7 +6,9 @@ use super::slots::Frame;
 const STEP: f32 = 0.25;
 /// No volume has more levels.
 const MOST: f32 = 32.0;
-/// Complete frames in a row before a finer level is tried.
+/// Share of the slots in use below which a finer level is tried.
+const ROOM: f32 = 0.5;
+/// Complete frames in a row before it is.
 const PATIENCE: u32 = 4;
 
 /// The level-of-detail bias that memory asks for.
@@ -44,23 +46,28 @@ impl Pressure {
     }
 
     /// A frame is known: whether it was complete, and which share of the slots it used.
-    pub(crate) fn report(&mut self, frame: Frame, next: Frame, complete: bool, used: f32) {
+    ///
+    /// Returns whether the bias moved or is about to, so that another frame is worth drawing.
+    pub(crate) fn report(&mut self, frame: Frame, next: Frame, complete: bool, used: f32) -> bool {
+        let refused = std::mem::take(&mut self.refused);
         if frame < self.since {
-            return;
+            return false;
         }
         self.complete = if complete { self.complete + 1 } else { 0 };
-        let finer = self.bias - STEP;
-        if self.refused && !complete {
+        if refused && !complete {
             self.too_fine = Some(self.bias);
             self.change(self.bias + STEP, next);
-        } else if self.bias > 0.0
-            && self.complete >= PATIENCE
-            && used < 0.5
-            && self.too_fine.is_none_or(|bias| finer > bias)
-        {
+            return true;
+        }
+        let finer = self.bias - STEP;
+        let may_fall = finer >= 0.0 && self.too_fine.is_none_or(|bias| finer > bias);
+        if !(may_fall && complete && used < ROOM) {
+            return false;
+        }
+        if self.complete >= PATIENCE {
             self.change(finer, next);
         }
-        self.refused = false;
+        true
     }
 
     fn change(&mut self, bias: f32, next: Frame) {

@@ -102,8 +102,10 @@ fn substitute(wanted: Source, depth: f32, ray: vec3f, urgency: f32) -> Source {
             other.leaving = min(other.leaving, wanted.leaving);
             return other;
         }
-        if level == wanted.level + PREVIEW_LEVELS || level + 1u == frame.level_count {
-            // Few bricks, soon there: before all others.
+        // Few bricks, soon there: before all others, and the one that shows everything first.
+        if level + 1u == frame.level_count {
+            mark_missed(other.found, urgency * 1e-6);
+        } else if level == wanted.level + PREVIEW_LEVELS {
             mark_missed(other.found, urgency * 1e-3);
         }
     }

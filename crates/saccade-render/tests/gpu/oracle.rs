@@ -129,7 +129,7 @@ fn interpolated(scene: &Scene, level: usize, voxel: DVec3) -> f64 {
 
 /// Linear RGB and extinction \[1/nm\] of a stored value.
 fn color(scene: &Scene, stored: f64) -> [f64; 4] {
-    let table = scene.transfer.table();
+    let table = &scene.table;
     let low = (stored.floor() as usize).min(254);
     let t = stored - low as f64;
     let entry = |index: usize| {

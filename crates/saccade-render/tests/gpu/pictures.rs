@@ -2,15 +2,12 @@
 
 use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
-use saccade_core::page_table::PageTableShape;
 use saccade_core::space::Point;
-use saccade_core::transfer::ColorMap;
-use saccade_core::volume::Polarity;
 use saccade_render::{Image, Renderer, RendererOptions, View};
 
 use crate::harness::{gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
-use crate::scene::{Scene, ramp, tissue, waves};
+use crate::scene::{Scene, tissue, waves};
 
 /// A picture counts as the oracle's from here on \[dB\].
 const SAME: f64 = 45.0;
@@ -96,4 +93,54 @@ fn waves_look_as_the_oracle_says() {
 #[test]
 fn tissue_looks_as_the_oracle_says() {
     compare("tissue", &tissue());
+}
+
+#[test]
+fn half_voxels_are_fine_enough() {
+    let scene = waves();
+    let view = View::new(Camera::around(&scene.volume).zoomed(1.5), SIZE);
+    let Some(got) = picture(&scene, &view, RendererOptions::default()) else {
+        return;
+    };
+    let db = psnr(&got, &oracle::render(&scene, &view, Cut::Fine));
+    assert!(db >= 38.0, "{db:.1} dB from the integral");
+    let jitter = View {
+        jitter: true,
+        ..view
+    };
+    let Some(jittered) = picture(&scene, &jitter, RendererOptions::default()) else {
+        return;
+    };
+    assert!(jittered != got);
+    let db = psnr(&got, &jittered);
+    assert!(db >= 33.0, "{db:.1} dB from jitter");
+}
+
+/// A comparison that cannot fail proves nothing.
+#[test]
+fn the_comparison_notices_small_differences() {
+    let scene = waves();
+    let camera = Camera::around(&scene.volume).zoomed(1.5);
+    let view = View::new(camera, SIZE);
+    let Some(got) = picture(&scene, &view, RendererOptions::default()) else {
+        return;
+    };
+    let want = |view: &View| oracle::render(&scene, view, Cut::HalfVoxels);
+    assert!(psnr(&got, &want(&view)) >= SAME);
+    let turned = View::new(camera.orbited(1.0, 0.0), SIZE);
+    let panned = View::new(camera.panned(glam::DVec2::X, f64::from(SIZE.y)), SIZE);
+    let coarser = View {
+        lod_bias: 1.0,
+        ..view
+    };
+    for (what, other) in [("turned", turned), ("panned", panned), ("coarser", coarser)] {
+        let db = psnr(&got, &want(&other));
+        assert!(db < SAME - 3.0, "{what}: {db:.1} dB");
+    }
+    let mut scene = waves();
+    for level in &mut scene.levels {
+        level.rotate_right(1);
+    }
+    let db = psnr(&got, &oracle::render(&scene, &view, Cut::HalfVoxels));
+    assert!(db < SAME - 3.0, "volume moved by a voxel: {db:.1} dB");
 }

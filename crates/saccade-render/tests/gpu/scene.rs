@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use glam::{DVec3, UVec3};
 use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
-use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
+use saccade_core::transfer::{ColorMap, OpacityPoint, TABLE_LEN, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
@@ -14,6 +14,7 @@ pub(crate) struct Scene {
     /// Per level, x fastest.
     pub(crate) levels: Vec<Vec<u8>>,
     pub(crate) transfer: TransferFunction,
+    pub(crate) table: [[f32; 4]; TABLE_LEN],
 }
 
 impl Scene {
@@ -49,6 +50,7 @@ impl Scene {
         Self {
             volume: Arc::new(volume),
             levels,
+            table: transfer.table(),
             transfer,
         }
     }

@@ -1,0 +1,87 @@
+//! The compiled ray-caster. Compiling takes a while, so all renderers of a device share one.
+
+use crate::layout::{FrameUniform, RAY_CAST};
+
+/// Format of the picture: portable for storage, read as it is by windows.
+pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
+
+/// The pipeline and the order of its bindings.
+#[derive(Debug)]
+pub(crate) struct RayCaster {
+    pub(crate) pipeline: wgpu::ComputePipeline,
+    pub(crate) layout: wgpu::BindGroupLayout,
+}
+
+impl RayCaster {
+    pub(crate) fn new(device: &wgpu::Device) -> Self {
+        let layout = bind_group_layout(device);
+        Self {
+            pipeline: pipeline(device, &layout),
+            layout,
+        }
+    }
+}
+
+fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
+    let storage = |read_only| wgpu::BindingType::Buffer {
+        ty: wgpu::BufferBindingType::Storage { read_only },
+        has_dynamic_offset: false,
+        min_binding_size: None,
+    };
+    let types = [
+        wgpu::BindingType::Buffer {
+            ty: wgpu::BufferBindingType::Uniform,
+            has_dynamic_offset: true,
+            min_binding_size: wgpu::BufferSize::new(size_of::<FrameUniform>() as u64),
+        },
+        storage(true),
+        storage(true),
+        storage(true),
+        storage(false),
+        storage(false),
+        storage(true),
+        wgpu::BindingType::Texture {
+            sample_type: wgpu::TextureSampleType::Float { filterable: true },
+            view_dimension: wgpu::TextureViewDimension::D3,
+            multisampled: false,
+        },
+        wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
+        wgpu::BindingType::StorageTexture {
+            access: wgpu::StorageTextureAccess::WriteOnly,
+            format: IMAGE_FORMAT,
+            view_dimension: wgpu::TextureViewDimension::D2,
+        },
+    ];
+    let entries = (0..)
+        .zip(types)
+        .map(|(binding, ty)| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty,
+            count: None,
+        });
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: Some("ray-caster"),
+        entries: &entries.collect::<Vec<_>>(),
+    })
+}
+
+fn pipeline(device: &wgpu::Device, layout: &wgpu::BindGroupLayout) -> wgpu::ComputePipeline {
+    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: Some("ray-caster"),
+        source: wgpu::ShaderSource::Wgsl(RAY_CAST.into()),
+    });
+    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some("ray-caster"),
+        bind_group_layouts: &[Some(layout)],
+        immediate_size: 0,
+    });
+    device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some("ray-caster"),
+        layout: Some(&layout),
+        module: &module,
+        entry_point: Some("main"),
+        compilation_options: wgpu::PipelineCompilationOptions::default(),
+        cache: None,
+    })
+}
