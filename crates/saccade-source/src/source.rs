@@ -102,6 +102,14 @@ impl ChunkError {
             Self::Failed { transient, .. } => *transient,
         }
     }
+
+    /// When the source wants to be asked again, if it says so.
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::NotReady { retry_after, .. } => Some(*retry_after),
+            Self::OutOfRange { .. } | Self::Failed { .. } => None,
+        }
+    }
 }
 
 /// Why a source could not be opened.

@@ -7,7 +7,10 @@ use saccade_core::levels::Level;
 use saccade_core::transfer::Histogram;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
-use saccade_source::{Chunk, ChunkId, VolumeSource};
+use saccade_source::maybe_send::sleep;
+use saccade_source::{Chunk, ChunkError, ChunkId, VolumeSource};
+
+use crate::policy::Retry;
 
 /// Chunks read of the coarsest level, to find where data are.
 const COARSE_CHUNKS: usize = 8;
@@ -30,7 +33,9 @@ pub struct Sample {
 
 /// Counts values where the coarsest level has data, in a few chunks of a level of medium
 /// resolution. Depends on nothing but the voxels: the same volume gives the same sample.
-pub async fn sample(source: &dyn VolumeSource) -> Sample {
+///
+/// Reads that fail for a passing reason are repeated a few times, as `retry` says.
+pub async fn sample(source: &dyn VolumeSource, retry: Retry) -> Sample {
     let volume = source.volume();
     let mut result = Sample::default();
     let Some((coarsest, counted)) = levels(volume) else {
@@ -39,10 +44,24 @@ pub async fn sample(source: &dyn VolumeSource) -> Sample {
     let all = VoxelBox::of_size(volume.chunks(coarsest as usize)).iter();
     let all: BTreeSet<Ordered> = all.map(|chunk| ordered(coarsest, chunk)).collect();
     let mut places = BTreeSet::new();
-    for (id, chunk) in read(source, spread(&all, COARSE_CHUNKS), &mut result.partial).await {
+    for (id, chunk) in read(
+        source,
+        retry,
+        spread(&all, COARSE_CHUNKS),
+        &mut result.partial,
+    )
+    .await
+    {
         places.extend(places_with_data(volume, id, &chunk, counted));
     }
-    for (id, chunk) in read(source, spread(&places, COUNTED_CHUNKS), &mut result.partial).await {
+    for (id, chunk) in read(
+        source,
+        retry,
+        spread(&places, COUNTED_CHUNKS),
+        &mut result.partial,
+    )
+    .await
+    {
         count(volume, id, &chunk, &mut result.histogram);
     }
     result
@@ -75,15 +94,34 @@ fn spread(chunks: &BTreeSet<Ordered>, count: usize) -> Vec<ChunkId> {
     chosen.map(id).collect()
 }
 
+/// Times a chunk is asked for before it is left out.
+const ATTEMPTS: u32 = 6;
+
+async fn read_patiently(
+    source: &dyn VolumeSource,
+    retry: Retry,
+    id: ChunkId,
+) -> Result<Chunk, ChunkError> {
+    let mut attempt = 1;
+    loop {
+        match source.read(id).await {
+            Err(error) if error.is_transient() && attempt < ATTEMPTS => {
+                sleep(retry.delay(attempt, error.retry_after())).await;
+                attempt += 1;
+            }
+            answer => return answer,
+        }
+    }
+}
+
 async fn read(
     source: &dyn VolumeSource,
+    retry: Retry,
     ids: Vec<ChunkId>,
     partial: &mut bool,
 ) -> Vec<(ChunkId, Vec<u8>)> {
-    let reads: Vec<_> = ids
-        .into_iter()
-        .map(|id| async move { (id, source.read(id).await) })
-        .collect();
+    let read = |id| async move { (id, read_patiently(source, retry, id).await) };
+    let reads: Vec<_> = ids.into_iter().map(read).collect();
     let answers: Vec<_> = futures::stream::iter(reads)
         .buffered(CONCURRENT)
         .collect()
@@ -146,11 +184,13 @@ fn count(volume: &Volume, id: ChunkId, chunk: &[u8], histogram: &mut Histogram) 
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
+    use std::sync::atomic::{AtomicU32, Ordering};
+    use std::time::Duration;
 
     use glam::{DVec3, UVec3};
+    use saccade_source::Change;
     use saccade_source::maybe_send::{BoxFuture, BoxStream};
     use saccade_source::memory::ArraySource;
-    use saccade_source::{Change, ChunkError};
 
     use super::*;
 
@@ -165,7 +205,15 @@ mod tests {
     }
 
     fn take(source: &dyn VolumeSource) -> Sample {
-        pollster::block_on(sample(source))
+        let retry = Retry {
+            first: Duration::from_millis(1),
+            longest: Duration::from_millis(2),
+        };
+        // Repetitions wait for a timer.
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_time()
+            .build();
+        runtime.unwrap().block_on(sample(source, retry))
     }
 
     #[test]
@@ -212,30 +260,44 @@ mod tests {
         assert_ne!(take(&fresh), Sample::default());
     }
 
-    /// Fails every read of the counted level.
-    struct Flaky(ArraySource);
+    /// Is not ready for the first reads of the counted level.
+    struct Flaky {
+        inner: ArraySource,
+        refusals: AtomicU32,
+    }
 
     impl VolumeSource for Flaky {
         fn volume(&self) -> &Arc<Volume> {
-            self.0.volume()
+            self.inner.volume()
         }
 
         fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
-            if id.level == 0 {
-                let retry_after = std::time::Duration::ZERO;
+            let one_less = |n: u32| n.checked_sub(1);
+            let refusals = &self.refusals;
+            let refuses = || refusals.fetch_update(Ordering::Relaxed, Ordering::Relaxed, one_less);
+            if id.level == 0 && refuses().is_ok() {
+                let retry_after = Duration::ZERO;
                 return Box::pin(async move { Err(ChunkError::NotReady { id, retry_after }) });
             }
-            self.0.read(id)
+            self.inner.read(id)
         }
 
         fn changes(&self) -> BoxStream<'static, Change> {
-            self.0.changes()
+            self.inner.changes()
         }
     }
 
     #[test]
-    fn what_could_not_be_read_is_told() {
-        let flaky = Flaky(source(UVec3::splat(70), |_| 9));
-        assert!(take(&flaky).partial);
+    fn a_source_that_hesitates_is_asked_again() {
+        let inner = || source(UVec3::splat(70), |_| 9);
+        let whole = take(&inner());
+        let flaky = |refusals| {
+            take(&Flaky {
+                inner: inner(),
+                refusals: AtomicU32::new(refusals),
+            })
+        };
+        assert_eq!(flaky(5), whole);
+        assert!(flaky(u32::MAX).partial, "what could not be read is told");
     }
 }

@@ -290,10 +290,7 @@ impl Pull {
                 self.window.insert(id, chunk);
             }
             Err(error) if error.is_transient() => {
-                let asked = match &error {
-                    ChunkError::NotReady { retry_after, .. } => Some(*retry_after),
-                    _ => None,
-                };
+                let asked = error.retry_after();
                 let attempts = attempts.saturating_add(1);
                 let until = now + self.limits.retry.delay(attempts, asked);
                 self.backoff.insert(key(id), Backoff { until, attempts });

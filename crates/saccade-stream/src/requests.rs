@@ -11,6 +11,7 @@ use saccade_source::{Change, Chunk, ChunkError, VolumeSource};
 use tokio::sync::Notify;
 
 use crate::histogram::{Sample, sample};
+use crate::policy::Retry;
 use crate::pull::{Actions, Ticket};
 use crate::session::Wake;
 
@@ -104,12 +105,12 @@ impl Requests {
     }
 
     /// Starts counting values; an earlier count that has not ended is dropped.
-    pub(crate) fn sample(&mut self) {
+    pub(crate) fn sample(&mut self, retry: Retry) {
         let (source, to, wake) = (self.source.clone(), self.sender.clone(), self.wake.clone());
         self.samples += 1;
         let number = self.samples;
         let handle = spawn_abortable(async move {
-            let sample = sample(&*source).await;
+            let sample = sample(&*source, retry).await;
             drop(to.send(Event::Sample { number, sample }));
             wake();
         });

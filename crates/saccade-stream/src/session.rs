@@ -16,7 +16,7 @@ use saccade_render::{
 use saccade_source::VolumeSource;
 
 use crate::clock::Clock;
-use crate::policy::{Limits, Refresh};
+use crate::policy::{Limits, Refresh, Retry};
 use crate::pull::{Progress, Pull};
 use crate::requests::{Event, Requests};
 
@@ -137,6 +137,7 @@ pub struct Session {
     transfer: TransferFunction,
     transfer_is_automatic: bool,
     frames_in_flight: usize,
+    retry: Retry,
     /// Frames without a report.
     pending: VecDeque<Submitted>,
     drawn: u64,
@@ -196,6 +197,7 @@ impl Session {
         renderer.set_transfer_function(&transfer);
         Ok(Self {
             renderer,
+            retry: options.limits.retry,
             pull: Pull::new(volume, options.limits),
             requests,
             clock: Clock::start(),
@@ -274,7 +276,7 @@ impl Session {
             self.take_report(report, now);
         }
         if self.refresh.starts(now) {
-            self.requests.sample();
+            self.requests.sample(self.retry);
         }
         self.requests.apply(self.pull.plan(now));
         let cut = self.deliver();
