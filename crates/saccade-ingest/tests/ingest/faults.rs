@@ -1,0 +1,161 @@
+//! Disks that fill, fail and lie.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use glam::UVec2;
+use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::Catalog;
+use saccade_archive::storage::{FaultyStorage, MemoryStorage, Storage, WriteFault};
+use saccade_ingest::Cancel;
+use saccade_ingest::ingest::{IngestError, run};
+
+use crate::scope::{Diary, Scope, VOLUME, orphans, pixels, quick, seen, texture};
+
+const SIZE: UVec2 = UVec2::new(140, 130);
+const TILES: u8 = 6;
+
+struct Bench {
+    scope: Scope,
+    storage: FaultyStorage,
+    archive: VisualizationArchive,
+    _folder: tempfile::TempDir,
+}
+
+impl Bench {
+    async fn new() -> Self {
+        let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+        for n in 0..TILES {
+            scope.tile(&format!("t{n}"), u32::from(n), SIZE, n);
+        }
+        let catalog = Catalog::create(&folder.path().join("catalog.sqlite"))
+            .await
+            .unwrap();
+        let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
+        let shared: Arc<dyn Storage> = Arc::new(storage.clone());
+        let archive = VisualizationArchive::from_parts(catalog, shared);
+        Self {
+            scope,
+            storage,
+            archive,
+            _folder: folder,
+        }
+    }
+
+    /// Everything arrived, and nothing else.
+    async fn is_complete(&self) {
+        let tiles = seen(&self.archive).await;
+        assert_eq!(tiles.len(), usize::from(TILES));
+        for n in 0..TILES {
+            let tile = &tiles[&format!("t{n}")];
+            assert_eq!(pixels(&self.archive, tile).await, texture(SIZE, n));
+        }
+        assert!(orphans(&self.archive).await.is_empty());
+        assert!(
+            self.archive
+                .catalog()
+                .quarantined(VOLUME)
+                .await
+                .unwrap()
+                .is_empty()
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_full_disk_is_waited_out() {
+    let easy = Bench::new().await;
+    easy.scope.ingest(&easy.archive).await;
+    let needed: usize = seen(&easy.archive)
+        .await
+        .values()
+        .map(|t| t.bytes.len())
+        .sum();
+
+    let bench = Bench::new().await;
+    bench.storage.set_space(Some(needed as u64 / 2));
+    let (diary, cancel) = (Diary::default(), Cancel::new());
+    let free = async {
+        while !diary.notices().iter().any(|n| n.contains("no space")) {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        // Many attempts later: nothing was given up.
+        tokio::time::sleep(Duration::from_millis(200)).await;
+        let tiles = seen(&bench.archive).await.len();
+        assert!(
+            tiles < usize::from(TILES),
+            "all {tiles} tiles fit; the disk was not full"
+        );
+        bench.storage.set_space(None);
+    };
+    let options = quick();
+    let ingest = run(
+        bench.scope.path(),
+        &bench.archive,
+        &options,
+        &diary,
+        &cancel,
+    );
+    let both = async { tokio::join!(ingest, free) };
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+    assert_eq!(both.expect("it ends").0.unwrap().tiles, u64::from(TILES));
+    bench.is_complete().await;
+}
+
+#[tokio::test]
+async fn a_write_that_fails_is_repeated() {
+    let bench = Bench::new().await;
+    for nth in [0, 1, 4] {
+        bench.storage.fail_write(nth, WriteFault::Fail);
+    }
+    let diary = Diary::default();
+    let ended = run(
+        bench.scope.path(),
+        &bench.archive,
+        &quick(),
+        &diary,
+        &Cancel::new(),
+    )
+    .await;
+    assert_eq!(ended.unwrap().tiles, u64::from(TILES));
+    assert!(bench.storage.writes() > u64::from(TILES));
+    assert!(
+        diary.notices().iter().any(|n| n.contains("trying again")),
+        "{:?}",
+        diary.notices()
+    );
+    bench.is_complete().await;
+}
+
+/// The process dies at each write in turn, before and after the pyramid is whole.
+#[tokio::test]
+async fn after_a_crash_at_any_write_nothing_is_lost() {
+    for fault in [WriteFault::CrashBefore, WriteFault::CrashAfter] {
+        for nth in 0..u64::from(TILES) {
+            let bench = Bench::new().await;
+            bench.storage.fail_write(nth, fault);
+            let ended = run(
+                bench.scope.path(),
+                &bench.archive,
+                &quick(),
+                &(),
+                &Cancel::new(),
+            )
+            .await;
+            assert!(
+                matches!(ended, Err(IngestError::Storage { .. })),
+                "{ended:?}"
+            );
+            assert!(bench.storage.has_crashed());
+            bench.storage.restart();
+            let before = seen(&bench.archive).await.len();
+            assert!(
+                before <= usize::try_from(nth).unwrap() + 1,
+                "{before} before write {nth}"
+            );
+            let rest = bench.scope.ingest(&bench.archive).await;
+            assert_eq!(rest.tiles + before as u64, u64::from(TILES), "none twice");
+            bench.is_complete().await;
+        }
+    }
+}

@@ -1,0 +1,213 @@
+//! Bad input: each kind is told apart, named with its file, and stops nothing.
+
+use std::fs;
+
+use glam::UVec2;
+use saccade_archive::acquisition::{Record, RecordReader, TileRecord};
+use saccade_archive::catalog::Quarantined;
+use saccade_ingest::Cancel;
+use saccade_ingest::ingest::run;
+
+use crate::scope::{
+    Diary, EXTENT, Scope, VOLUME, archive, at, move_record, orphans, pixels, quick, seen, texture,
+    tiff16, tile_record,
+};
+
+const SIZE: UVec2 = UVec2::new(140, 130);
+
+/// Ingests a bad record between two good ones, and returns what is said of it.
+async fn refused(bad: impl FnOnce(&Scope)) -> Quarantined {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    scope.tile("before", 0, SIZE, 1);
+    bad(&scope);
+    scope.tile("after", 0, SIZE, 2);
+    let diary = Diary::default();
+    let summary = run(scope.path(), &archive, &quick(), &diary, &Cancel::new())
+        .await
+        .unwrap();
+    assert_eq!((summary.tiles, summary.quarantined), (2, 1));
+    let tiles = seen(&archive).await;
+    assert_eq!(tiles.keys().collect::<Vec<_>>(), ["after", "before"]);
+    assert!(orphans(&archive).await.is_empty());
+    let mut quarantined = archive.catalog().quarantined(VOLUME).await.unwrap();
+    assert_eq!(quarantined.len(), 1, "{quarantined:?}");
+    let notices = diary.notices();
+    assert!(
+        notices.iter().any(|n| n.contains(&quarantined[0].reason)),
+        "{notices:?}"
+    );
+    assert_eq!(diary.states().last().unwrap().quarantined, 1);
+    assert_eq!(diary.states().last().unwrap().waiting, 0);
+
+    // Not again by the next process.
+    assert_eq!(scope.ingest(&archive).await.quarantined, 0);
+    assert_eq!(
+        archive.catalog().quarantined(VOLUME).await.unwrap(),
+        quarantined
+    );
+    quarantined.remove(0)
+}
+
+fn says(what: &Quarantined, words: &[&str]) {
+    for word in words {
+        assert!(
+            what.reason.contains(word),
+            "{:?} does not say {word:?}",
+            what.reason
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_16_bit_tile() {
+    let bytes = tiff16(SIZE);
+    let len = bytes.len() as u64;
+    let what = refused(|scope| {
+        fs::write(scope.file("deep"), bytes).unwrap();
+        scope.say(&tile_record("deep", 0, SIZE));
+    })
+    .await;
+    assert_eq!(
+        (what.file.as_str(), what.tile.as_deref()),
+        ("tiles/deep.tif", Some("deep"))
+    );
+    assert_eq!(what.bytes, Some(len));
+    says(&what, &["16", "8"]);
+}
+
+#[tokio::test]
+async fn a_damaged_file() {
+    let what = refused(|scope| {
+        fs::write(scope.file("bad"), vec![b'x'; 5000]).unwrap();
+        scope.say(&tile_record("bad", 0, SIZE));
+    })
+    .await;
+    assert_eq!(what.file, "tiles/bad.tif");
+    assert_eq!(what.bytes, Some(5000));
+}
+
+#[tokio::test]
+async fn a_file_that_stays_half() {
+    let what = refused(|scope| {
+        let whole = scope.image("half", SIZE, 3);
+        fs::write(scope.file("half"), &whole[..whole.len() / 2]).unwrap();
+        scope.say(&tile_record("half", 0, SIZE));
+    })
+    .await;
+    says(
+        &what,
+        &["complete", "has not changed", "append its record again"],
+    );
+}
+
+#[tokio::test]
+async fn an_empty_file() {
+    let what = refused(|scope| {
+        fs::write(scope.file("empty"), "").unwrap();
+        scope.say(&tile_record("empty", 0, SIZE));
+    })
+    .await;
+    assert_eq!(what.bytes, Some(0));
+    says(&what, &["has not changed"]);
+}
+
+#[tokio::test]
+async fn a_file_that_never_comes() {
+    let what = refused(|scope| scope.say(&tile_record("ghost", 0, SIZE))).await;
+    assert_eq!((what.file.as_str(), what.bytes), ("tiles/ghost.tif", None));
+    says(&what, &["exists", "has not changed"]);
+}
+
+#[tokio::test]
+async fn a_tile_outside_the_volume() {
+    let what = refused(|scope| scope.tile("low", EXTENT.z, SIZE, 3)).await;
+    says(&what, &["outside", "section 20", "extent"]);
+    let what = refused(|scope| {
+        scope.image("far", SIZE, 3);
+        let Record::Tile(mut record) = tile_record("far", 0, SIZE) else {
+            unreachable!()
+        };
+        record.transform = at(-140.0, 0.0);
+        scope.say(&Record::Tile(record));
+    })
+    .await;
+    says(&what, &["outside", "-140"]);
+}
+
+#[tokio::test]
+async fn a_record_of_another_size() {
+    let what = refused(|scope| {
+        scope.image("small", SIZE, 3);
+        scope.say(&tile_record("small", 0, SIZE + UVec2::X));
+    })
+    .await;
+    says(&what, &["140 x 130", "141 x 130"]);
+}
+
+#[tokio::test]
+async fn a_path_out_of_the_archive() {
+    for file in ["../secret.tif", "/etc/passwd"] {
+        let what = refused(|scope| {
+            let (file, tile) = (file.to_owned(), "thief".to_owned());
+            let record = TileRecord {
+                tile,
+                file,
+                section: 0,
+                size: SIZE,
+                transform: at(0.0, 0.0),
+            };
+            scope.say(&Record::Tile(record));
+        })
+        .await;
+        assert_eq!(what.file, file);
+        says(&what, &["outside the acquisition archive"]);
+    }
+}
+
+#[tokio::test]
+async fn a_line_that_is_no_record() {
+    let what = refused(|scope| {
+        let path = scope.path().join(RecordReader::FILE);
+        let mut text = fs::read(&path).unwrap();
+        text.extend(b"{\"record\":\"tile\",\"tile\":7}\n");
+        fs::write(path, text).unwrap();
+    })
+    .await;
+    assert_eq!(
+        (what.file.as_str(), what.tile.as_deref()),
+        (RecordReader::FILE, None)
+    );
+    says(&what, &["line 2"]);
+}
+
+#[tokio::test]
+async fn a_transform_out_of_the_volume() {
+    let what = refused(|scope| scope.say(&move_record("before", at(5000.0, 0.0)))).await;
+    assert_eq!(what.tile.as_deref(), Some("before"));
+    says(&what, &["outside", "stays where it is"]);
+}
+
+#[tokio::test]
+async fn a_mended_tile_leaves_quarantine() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    fs::write(scope.file("a"), tiff16(SIZE)).unwrap();
+    scope.say(&tile_record("a", 0, SIZE));
+    assert_eq!(scope.ingest(&archive).await.quarantined, 1);
+    // As the message advises: mend the file, say it again.
+    scope.tile("a", 0, SIZE, 5);
+    assert_eq!(scope.ingest(&archive).await.tiles, 1);
+    assert!(
+        archive
+            .catalog()
+            .quarantined(VOLUME)
+            .await
+            .unwrap()
+            .is_empty()
+    );
+    assert_eq!(
+        pixels(&archive, &seen(&archive).await["a"]).await,
+        texture(SIZE, 5)
+    );
+}
