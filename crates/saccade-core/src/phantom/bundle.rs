@@ -17,8 +17,9 @@ const JITTER: f64 = 0.38;
 const WEIGHT: f64 = 0.14;
 /// A bundle never owns a point further from its centre than this \[nm\].
 const OWNED_NM: f64 = 4_500.0;
-/// Share of sites that have a synapse with a neighbour, where the two really touch.
-const SYNAPSE_SHARE: f64 = 0.3;
+/// Share of sites that have a synapse with a neighbour, where the two really touch: about one
+/// synapse per cubic micrometre, as in cortex.
+const SYNAPSE_SHARE: f64 = 0.6;
 /// A synapse shows no further from its middle than this \[nm\].
 pub(super) const SYNAPSE_REACH_NM: f64 = 330.0;
 
@@ -311,5 +312,22 @@ impl Bundle {
             site: *owner,
             border_nm,
         }
+    }
+
+    /// The owner of a point and the distance to its border, from many more sites than needed.
+    #[cfg(test)]
+    pub(super) fn far_and_wide(&self, at: DVec3) -> (u64, f64) {
+        let mut sites = Vec::new();
+        for n in 0..11_i32.pow(3) {
+            let offset = IVec3::new(n % 11, n / 11 % 11, n / 121) - 5;
+            sites.push(self.site(floor3(at) + offset));
+        }
+        sites.sort_by(|a, b| a.distance(at).total_cmp(&b.distance(at)));
+        let owner = sites[0];
+        let ahead = |site: &Site| site.distance(at) - owner.distance(at);
+        let borders = sites[1..]
+            .iter()
+            .map(|site| ahead(site) / self.steepness(&owner, site));
+        (owner.id, borders.fold(f64::INFINITY, f64::min))
     }
 }

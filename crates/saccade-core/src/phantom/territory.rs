@@ -231,3 +231,17 @@ pub(super) fn bundles(seed: u64, min: DVec3, max: DVec3) -> Vec<Territory> {
     });
     found
 }
+
+/// Everything that could matter at a point, and much that cannot.
+#[cfg(test)]
+pub(super) fn far_and_wide(seed: u64, point: DVec3) -> Vec<Territory> {
+    let mut found = Vec::new();
+    cells(point, point, BUNDLE_SPACING_NM, 4, |cell| {
+        found.push(bundle(seed, cell))
+    });
+    cells(point, point, SOMA_SPACING_NM, 2, |cell| {
+        found.extend(soma(seed, cell))
+    });
+    vessels(seed, point - 9_000.0, point + 9_000.0, &mut found);
+    found
+}
