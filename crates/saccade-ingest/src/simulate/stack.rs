@@ -200,3 +200,6 @@ fn cropped(section: &GrayImage, min: UVec2, size: UVec2) -> GrayImage {
     }
     GrayImage::new(size.x, size.y, voxels)
 }
+
+#[cfg(test)]
+mod tests;
