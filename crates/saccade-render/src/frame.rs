@@ -18,6 +18,9 @@ const ANCHOR_REACH: f64 = 1e6;
 /// More levels than this finer or coarser make no sense.
 const MOST_BIAS: f32 = 32.0;
 
+/// Extinction beyond which nothing is seen any more, yet finite \[1/nm\].
+const OPAQUE: f64 = 1e6;
+
 /// The numbers of a frame. A camera that is not finite sees nothing but background.
 pub(crate) fn frame_uniform(
     view: &View,
@@ -93,7 +96,7 @@ pub(crate) fn transfer_storage(transfer: &TransferFunction) -> TransferStorage {
     let length_nm = transfer.opacity_length_nm.max(f64::MIN_POSITIVE);
     for (index, [r, g, b, opacity]) in transfer.table().into_iter().enumerate() {
         let extinction = -(-f64::from(opacity)).ln_1p() / length_nm;
-        storage.colors[index] = [r, g, b, extinction as f32];
+        storage.colors[index] = [r, g, b, extinction.min(OPAQUE) as f32];
         let opaque = u32::from(storage.colors[index][3] > 0.0);
         storage.opaque_before[index + 1] = storage.opaque_before[index] + opaque;
     }
@@ -120,6 +123,32 @@ mod tests {
             (eye.as_vec3().as_dvec3() - eye).abs().max_element() > 1e-3,
             "f32 alone is not"
         );
+    }
+
+    #[test]
+    fn opacity_of_no_length_is_not_infinite() {
+        use saccade_core::transfer::{ColorMap, OpacityPoint};
+        let mut transfer = TransferFunction {
+            polarity: Default::default(),
+            color_map: ColorMap::Gray,
+            window: [0.0, 1.0],
+            opacity: vec![OpacityPoint {
+                value: 0.0,
+                opacity: 0.5,
+            }],
+            opacity_length_nm: 100.0,
+        };
+        let storage = transfer_storage(&transfer);
+        assert_eq!(
+            (storage.colors[0][3], storage.opaque_before[TABLE_LEN]),
+            (0.0, 255)
+        );
+        assert!((storage.colors[9][3] - 0.5_f32.ln().abs() / 100.0).abs() < 1e-6);
+        for length in [0.0, -1.0, f64::NAN, 1e-300] {
+            transfer.opacity_length_nm = length;
+            let colors = transfer_storage(&transfer).colors;
+            assert!(colors.iter().flatten().all(|c| c.is_finite()), "{length}");
+        }
     }
 
     #[test]

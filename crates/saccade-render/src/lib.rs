@@ -1,4 +1,72 @@
 //! GPU virtual memory and the ray-caster.
+//!
+//! [`Renderer`] draws one volume from the bricks that are resident right now. It never waits for
+//! data: what a frame wanted and did not find is in its [`FrameReport`], and the caller delivers it
+//! when it can. The same code and the same shaders run natively and in browsers.
+//!
+//! # The way of a frame
+//!
+//! ```text
+//!            render(view)                 finish() or poll()               deliver(id, voxels)
+//! View ─────► flush changed entries        counters, usage, misses  ──────► slot, entry, texture
+//!             rays ─► directory ─► tables ─► brick cache                     (least recently used
+//!                       │ missed entry, once a frame        FrameReport      goes, never what the
+//!                       └ used slot, a bit                  misses, fidelity  last frame used)
+//! ```
+//!
+//! 1. [`Renderer::render`] uploads what changed in the page tables, casts one ray per pixel, and
+//!    asks for the report. It returns at once.
+//! 2. A ray walks from the page directory through page table blocks to a brick \[000 §4.1.3\]. An
+//!    unmapped entry is marked by its *physical* number in a dense bitmask and listed once, at most
+//!    four per ray, front to back \[000 §4.2.2\].
+//! 3. [`Renderer::poll`] reads reports that have arrived. Missing page table blocks are made at
+//!    once, so the bricks behind them show up in the next report ([`FrameReport::redraw`]).
+//! 4. [`Renderer::deliver`] gives a brick the slot that was used longest ago.
+//!
+//! When the bricks of a view do not fit, the level of detail becomes coarser until they do, the
+//! report says so ([`FrameReport::memory_bias`]), and it becomes finer again when it can.
+//!
+//! # Spaces and units
+//!
+//! Lengths are nanometres (`_nm`), positions in a level are voxels of that level. A ray is
+//! `eye + t * direction` where `t`, its *depth*, counts nanometres along the viewing direction.
+//! Positions reach the shader as a brick near the eye and an offset in voxels, per level, so f32
+//! is precise to a hundredth of a voxel wherever the eye is in a petascale volume: a level is only
+//! wanted within some thousands of its voxels from the eye.
+//!
+//! # What a picture is
+//!
+//! A ray is cut into segments, from where it enters the volume or starts at the eye.
+//!
+//! - The **level** wanted at a segment's start is the one whose voxel is nearest to a pixel in size,
+//!   by ratio. A voxel's size is the root of the area of its shadow along the ray: for voxels of
+//!   4 x 4 x 40 nm, 4 nm seen from the front and 13 nm from the side. A pixel's size is
+//!   [`Camera::pixel_nm`](saccade_core::camera::Camera::pixel_nm) at that depth, times 2 to the power of the level-of-detail bias.
+//! - A **segment** is half a voxel of the wanted level long, measured along the ray in voxels of
+//!   that level, the last one shorter. After 8192 segments it doubles, so that every ray ends.
+//! - It is **sampled** once, in its middle (or elsewhere in it, with [`View::jitter`]): trilinear
+//!   within one level. Outside the volume is what bricks carry there, as a rule nothing.
+//! - Its **colour** comes from the table of the transfer function, between two entries by their
+//!   linear light and extinction; its **opacity** is `1 - exp(-extinction * length)`. Pictures do
+//!   not depend on the step.
+//! - Segments are composited front to back in linear light over [`View::background`], until less
+//!   than 1/4096 of the light is left, and encoded as sRGB.
+//! - What is **missing** is drawn from the nearest coarser level that is there, else from up to two
+//!   levels finer, else not at all. Where no good substitute is there, a brick two levels coarser
+//!   and the coarsest one are asked for first: they come soon and show much.
+//! - Bricks that are empty, and those the transfer function hides entirely, cost one lookup.
+//!
+//! # Failure
+//!
+//! No adapter, an impossible ceiling, a volume that is not 8 bit: typed errors when things are
+//! made. A missing brick is not an error. Errors of the device while drawing are logged and end
+//! nothing; a lost device is told by [`Gpu::is_lost`], and everything made with it is to be made
+//! again. A camera that is not finite sees background.
+//!
+//! # What it does not do
+//!
+//! It fetches nothing, opens no window, starts no thread and reads no clock. One channel, 8 bit,
+//! one-dimensional transfer functions.
 
 mod frame;
 mod gpu;
@@ -20,4 +88,5 @@ pub use renderer::{
 };
 pub use report::{Fidelity, FrameReport, MemoryUse, Statistics};
 pub use view::View;
+/// The GPU interface, so that all rooms use one version.
 pub use wgpu;

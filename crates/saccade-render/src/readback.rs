@@ -20,6 +20,26 @@ struct Mapping {
     waker: Option<Waker>,
 }
 
+/// Ends a mapping. Dropped unused, as by a lost device, it ends it as failed.
+#[derive(Debug)]
+struct End(Arc<Mutex<Mapping>>);
+
+impl End {
+    fn set(&self, arrived: bool) {
+        let mut mapping = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        mapping.done.get_or_insert(arrived);
+        if let Some(waker) = mapping.waker.take() {
+            waker.wake();
+        }
+    }
+}
+
+impl Drop for End {
+    fn drop(&mut self) {
+        self.set(false);
+    }
+}
+
 /// A buffer that the GPU fills and the CPU then reads.
 #[derive(Debug)]
 pub(crate) struct Staging {
@@ -53,14 +73,11 @@ impl Staging {
     /// Asks for what the commands submitted so far leave in the buffer.
     pub(crate) fn begin(&mut self) {
         let mapping = Arc::<Mutex<Mapping>>::default();
-        self.mapping = Some(Arc::clone(&mapping));
+        let end = End(Arc::clone(&mapping));
+        self.mapping = Some(mapping);
         self.buffer
             .map_async(wgpu::MapMode::Read, .., move |result| {
-                let mut mapping = mapping.lock().unwrap_or_else(PoisonError::into_inner);
-                mapping.done = Some(result.is_ok());
-                if let Some(waker) = mapping.waker.take() {
-                    waker.wake();
-                }
+                end.set(result.is_ok())
             });
     }
 

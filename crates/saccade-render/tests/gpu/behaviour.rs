@@ -570,3 +570,21 @@ fn mistakes_are_told() {
         Some(RendererError::Dtype { .. })
     ));
 }
+
+#[test]
+fn a_lost_device_is_noticed_and_nobody_waits_for_it() {
+    if gpu().is_none() {
+        return;
+    }
+    let gpu = pollster::block_on(Gpu::headless()).unwrap();
+    let scene = waves();
+    let view = View::new(Camera::around(&scene.volume), SIZE);
+    let mut renderer = renderer(&gpu, &scene, RendererOptions::default());
+    frame(&mut renderer, &view);
+    assert!(!gpu.is_lost());
+    gpu.device().destroy();
+    renderer.render(&view);
+    assert!(pollster::block_on(renderer.finish()).is_empty());
+    assert!(pollster::block_on(renderer.read_pixels()).is_err());
+    assert!(gpu.is_lost());
+}
