@@ -33,6 +33,9 @@ fn bundle(module: &Path, page: &Path, out: &Path) -> Result<()> {
         .out_name("saccade_view")
         .web(true)?
         .typescript(false)
+        .omit_default_module_path(false)
+        .remove_name_section(true)
+        .remove_producers_section(true)
         .generate(&new)
         .with_context(|| format!("cannot make the bindings of {}", module.display()))?;
     copy_files(page, &new)?;

@@ -10,11 +10,13 @@ function fail(text) {
   window.saccade.error = text;
 }
 
+let loaded = false;
+
 // For scripts: what the picture shows right now, or null before the first one.
 window.saccade = {
   error: null,
   status: () => {
-    const json = status();
+    const json = loaded ? status() : "";
     return json ? JSON.parse(json) : null;
   },
 };
@@ -40,6 +42,7 @@ async function main() {
   if (!(await navigator.gpu.requestAdapter())) return fail(noAdapter);
   try {
     await init();
+    loaded = true;
     await start("saccade");
     message.hidden = true;
   } catch (error) {
