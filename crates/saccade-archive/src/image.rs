@@ -23,6 +23,9 @@ mod tests;
 /// Largest width or height \[pixels\]: 12 levels above one sub-tile, whose sums fit 32 bits.
 pub const MAX_EDGE: u32 = 1 << 19;
 
+/// Most pixels that an image is decoded to; four gigabytes.
+const MAX_PIXELS: u64 = 1 << 32;
+
 /// An 8-bit grey image.
 #[derive(Clone, PartialEq, Eq)]
 pub struct GrayImage {
@@ -143,13 +146,10 @@ pub fn decode_file(path: &Path) -> Result<GrayImage, ImageError> {
 /// The number of pixels, if it is one that a tile can have.
 fn check_size(width: u32, height: u32) -> Result<usize, ImageError> {
     let edges = 1..=MAX_EDGE;
-    let pixels = usize::try_from(u64::from(width) * u64::from(height));
-    match pixels {
-        Ok(pixels) if edges.contains(&width) && edges.contains(&height) => Ok(pixels),
-        _ => Err(sniff::broken(format!(
-            "its size is {width} x {height} pixels"
-        ))),
-    }
+    let pixels = u64::from(width) * u64::from(height);
+    let possible = edges.contains(&width) && edges.contains(&height) && pixels <= MAX_PIXELS;
+    let pixels = usize::try_from(pixels).ok().filter(|_| possible);
+    pixels.ok_or_else(|| sniff::broken(format!("its size is {width} x {height} pixels")))
 }
 
 /// Zeros, or an error where memory does not suffice.

@@ -1,3 +1,6 @@
+#![expect(clippy::cast_possible_truncation, reason = "texture wraps")]
+#![expect(clippy::print_stderr, reason = "a skipped test says so")]
+
 use std::fs;
 use std::io::Cursor;
 use std::path::PathBuf;

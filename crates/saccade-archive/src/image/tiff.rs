@@ -36,14 +36,14 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
             });
         }
     };
-    let stored = check_data(&mut decoder, bytes.len() as u64)?;
+    check_data(&mut decoder, bytes.len() as u64)?;
     let layout = decoder.image_buffer_layout().map_err(sort)?;
     if layout.len != pixels * channels || layout.complete_len != layout.len {
         return Err(ImageError::Unsupported {
             what: "a TIFF of several planes".to_owned(),
         });
     }
-    check_ratio(stored, layout.len)?;
+    check_ratio(bytes.len(), layout.len)?;
     let mut voxels = allocate(layout.len)?;
     decoder.read_image_bytes(&mut voxels).map_err(sort)?;
     Ok(GrayImage::new(width, height, luma(voxels, channels)))
@@ -65,8 +65,8 @@ fn check_header(bytes: &[u8]) -> Result<(), ImageError> {
     Ok(())
 }
 
-/// Checks that all strips or tiles lie within the file. Returns their bytes.
-fn check_data(decoder: &mut Decoder<Cursor<&[u8]>>, len: u64) -> Result<u64, ImageError> {
+/// Checks that all strips or tiles lie within the file.
+fn check_data(decoder: &mut Decoder<Cursor<&[u8]>>, len: u64) -> Result<(), ImageError> {
     let mut values = |tags: [Tag; 2]| {
         for tag in tags {
             if let Some(values) = decoder.find_tag_unsigned_vec::<u64>(tag).map_err(sort)? {
@@ -77,7 +77,6 @@ fn check_data(decoder: &mut Decoder<Cursor<&[u8]>>, len: u64) -> Result<u64, Ima
     };
     let offsets = values([Tag::StripOffsets, Tag::TileOffsets])?;
     let lens = values([Tag::StripByteCounts, Tag::TileByteCounts])?;
-    let mut stored = 0_u64;
     for (&offset, &count) in offsets.iter().zip(&lens) {
         if offset == 0 || count == 0 {
             return Err(incomplete("a part of its pixels has not been written"));
@@ -90,16 +89,16 @@ fn check_data(decoder: &mut Decoder<Cursor<&[u8]>>, len: u64) -> Result<u64, Ima
                 "its pixels end at byte {end}, the file at {len}"
             )));
         }
-        stored = stored.saturating_add(count);
     }
-    Ok(stored)
+    Ok(())
 }
 
 /// Refuses sizes that so few bytes cannot hold, before memory is set aside for them.
-fn check_ratio(stored: u64, pixels: usize) -> Result<(), ImageError> {
-    /// LZW packs a little more than 1:1300, deflate 1:1032.
-    const MAX_RATIO: u64 = 2048;
-    if pixels as u64 / MAX_RATIO > stored {
+fn check_ratio(stored: usize, pixels: usize) -> Result<(), ImageError> {
+    /// LZW packs a little more than 1:1300, deflate 1:1032; blank tiles that share one stream
+    /// take 8 bytes of offset and count for 1:2048 pixels.
+    const MAX_RATIO: usize = 2048;
+    if pixels / MAX_RATIO > stored {
         return Err(broken(format!(
             "{stored} bytes cannot hold {pixels} pixels"
         )));

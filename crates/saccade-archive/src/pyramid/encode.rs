@@ -78,10 +78,10 @@ pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, Enc
     // What is left is a 256th of the image.
     let mut encoder = Encoder::new(encoding)?;
     let mut task = Task::new(image, &levels, &mut encoder);
-    for level in task_level + 1..levels.len() {
+    for (level, size) in levels.iter().enumerate().skip(task_level + 1) {
         let Some(sums) = plane.take() else { break };
         let pixels = sums.means(level, (width, height));
-        for at in in_morton_order(levels[level].sub_tiles) {
+        for at in in_morton_order(size.sub_tiles) {
             task.encode_part(level, at, &pixels, sums.width)?;
         }
         plane = Some(sums.halved());

@@ -5,11 +5,11 @@ use super::layout::{
     IMAGE_WIDTH, INDEX_LEN, JPEG_TABLES, LONG, LONG8, PREDICTOR, PREDICTOR_HORIZONTAL, SHORT,
     SUB_IFDS, SUB_TILE_STATS, TILE_BYTE_COUNTS, TILE_LENGTH, TILE_OFFSETS, TILE_WIDTH, UNDEFINED,
 };
-use super::{PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS, SubTileEntry, levels_of};
+use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry, levels_of};
 use crate::image::MAX_EDGE;
 
 /// No sub-tile is longer: four times its voxels.
-const MAX_SUB_TILE_LEN: u32 = 4 * SUB_TILE_VOXELS as u32;
+const MAX_SUB_TILE_LEN: u32 = 4 * SUB_TILE_EDGE * SUB_TILE_EDGE;
 /// Files do not end past this, so that sums of offsets and lengths do not overflow.
 const MAX_OFFSET: u64 = 1 << 62;
 
@@ -186,7 +186,7 @@ impl<'a> File<'a> {
     }
 
     fn directory(&self, at: u64) -> Result<Directory<'a>, Reason> {
-        let (count_len, entry_len) = if self.big { (8, 20) } else { (2, 12) };
+        let (count_len, entry_len): (usize, usize) = if self.big { (8, 20) } else { (2, 12) };
         let count = self.number(at, count_len)?;
         // More entries than tags there are: refused before they are multiplied.
         if count > 1 << 16 {
@@ -195,8 +195,8 @@ impl<'a> File<'a> {
         let mut fields = Vec::new();
         let begin = at + count_len as u64;
         for entry in self
-            .slice(begin, count * entry_len)?
-            .chunks_exact(entry_len as usize)
+            .slice(begin, count * entry_len as u64)?
+            .chunks_exact(entry_len)
         {
             let (head, value) = entry.split_at(4 + self.width());
             let (tag, kind) = (short(&head[..2]), short(&head[2..4]));

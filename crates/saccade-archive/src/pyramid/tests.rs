@@ -1,3 +1,8 @@
+#![expect(
+    clippy::cast_possible_truncation,
+    reason = "small images; a failed test at worst"
+)]
+
 use std::io::Cursor;
 use std::sync::Arc;
 

@@ -15,8 +15,11 @@ use super::{Storage, StorageError, check_name};
 /// Where unfinished writes live, below the root. No object's name begins with a dot.
 const INCOMING: &str = ".incoming";
 
-/// How often a write begins again whose temporary file someone removed.
-const WRITE_ATTEMPTS: u32 = 3;
+/// How often a write begins whose temporary file someone has, or removes.
+const WRITE_ATTEMPTS: u32 = 100;
+
+/// Number of this process's next temporary file.
+static NEXT: AtomicU64 = AtomicU64::new(0);
 
 /// Objects as files below a folder, local or on a shared file system.
 ///
@@ -30,7 +33,8 @@ pub struct LocalStorage {
 impl LocalStorage {
     /// Opens the folder, which is created if need be, and removes what crashed writers left.
     ///
-    /// Other processes may be writing to the same folder: theirs is left alone.
+    /// Other processes may be writing to the same folder: theirs is left alone. A folder that may
+    /// only be read is opened, too; writes are then denied.
     ///
     /// # Errors
     ///
@@ -40,10 +44,15 @@ impl LocalStorage {
             root: root.into().into(),
         };
         let incoming = storage.root.join(INCOMING);
-        let failed = |e, path: &Path| StorageError::new(e, "", path.display().to_string());
-        create_dirs(&incoming).map_err(|e| failed(e, &incoming))?;
-        for entry in fs::read_dir(&incoming).map_err(|e| failed(e, &incoming))? {
-            remove_if_abandoned(&entry.map_err(|e| failed(e, &incoming))?.path());
+        let sort = |e| StorageError::new(e, INCOMING, incoming.display().to_string());
+        match create_dirs(&incoming).map_err(sort) {
+            Err(StorageError::Denied { .. }) if fs::read_dir(&storage.root).is_ok() => {
+                return Ok(storage);
+            }
+            created => created?,
+        }
+        for entry in fs::read_dir(&incoming).map_err(sort)? {
+            remove_if_abandoned(&entry.map_err(sort)?.path());
         }
         Ok(storage)
     }
@@ -78,30 +87,33 @@ impl LocalStorage {
     fn write(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
         let parent = path.parent().unwrap_or(&self.root);
         create_dirs(parent)?;
-        let mut attempt = 1;
-        loop {
+        for _ in 1..WRITE_ATTEMPTS {
             match self.write_once(path, bytes) {
-                // Another process cleaned up between this one's creating and locking the file.
-                Err(e) if e.kind() == io::ErrorKind::NotFound && attempt < WRITE_ATTEMPTS => {
-                    attempt += 1;
+                Ok(()) => return sync_dir(parent),
+                // Another process cleaned up between this one's creating and locking the file, or
+                // someone emptied the whole folder.
+                Err(e) if e.kind() == io::ErrorKind::NotFound => {
+                    create_dirs(&self.root.join(INCOMING))?;
+                    create_dirs(parent)?;
                 }
-                done => break done?,
+                // A process of the same number, on another machine or before this one.
+                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(e) => return Err(e),
             }
         }
-        sync_dir(parent)
+        Err(io::Error::other("other writers keep interfering"))
     }
 
     fn write_once(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
-        static NEXT: AtomicU64 = AtomicU64::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let temporary = self
             .root
             .join(INCOMING)
             .join(format!("{}-{number}", std::process::id()));
-        let write = || {
-            let mut file = File::create(&temporary)?;
-            // Tells a cleaner that the writer lives. Where locks do not exist, cleaners find none.
-            let _ = file.try_lock();
+        let mut file = File::create_new(&temporary)?;
+        // Tells a cleaner that the writer lives. Where locks do not exist, cleaners get none.
+        let _ = file.try_lock();
+        let mut write = || {
             file.write_all(bytes)?;
             file.sync_all()?;
             fs::rename(&temporary, path)
@@ -149,7 +161,12 @@ fn sync_dir(path: &Path) -> io::Result<()> {
 
 /// Adds the names of the files below `dir` to `names`; `at` is the folder's own name with a slash.
 fn walk(dir: &Path, at: &str, prefix: &str, names: &mut Vec<String>) -> io::Result<()> {
-    for entry in fs::read_dir(dir)? {
+    let entries = match fs::read_dir(dir) {
+        // Removed since its parent was read.
+        Err(e) if e.kind() == io::ErrorKind::NotFound && !at.is_empty() => return Ok(()),
+        entries => entries?,
+    };
+    for entry in entries {
         let entry = entry?;
         let Ok(part) = entry.file_name().into_string() else {
             continue;
@@ -269,6 +286,103 @@ mod tests {
                 .is_err()
         );
         assert_eq!(fs::read_dir(dir.path().join(INCOMING)).unwrap().count(), 0);
+    }
+
+    #[tokio::test]
+    async fn temporaries_of_others_are_neither_touched_nor_in_the_way() {
+        let dir = tempfile::tempdir().unwrap();
+        let storage = LocalStorage::new(dir.path()).unwrap();
+        let incoming = dir.path().join(INCOMING);
+        // The same process number on another machine: the next names are all taken.
+        let write = || storage.write_durable("a", Bytes::from_static(b"ours"));
+        write().await.unwrap();
+        let next = NEXT.load(Ordering::Relaxed);
+        for number in next..next + 60 {
+            fs::write(
+                incoming.join(format!("{}-{number}", std::process::id())),
+                b"theirs",
+            )
+            .unwrap();
+        }
+        write().await.unwrap();
+        assert_eq!(storage.read("a", None).await.unwrap(), b"ours"[..]);
+        for entry in fs::read_dir(&incoming).unwrap() {
+            assert_eq!(fs::read(entry.unwrap().path()).unwrap(), b"theirs");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_folder_emptied_by_someone_is_made_anew() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path().join("root");
+        let storage = LocalStorage::new(&root).unwrap();
+        fs::remove_dir_all(&root).unwrap();
+        storage
+            .write_durable("tiles/a", Bytes::from_static(b"abc"))
+            .await
+            .unwrap();
+        assert_eq!(storage.list("").await.unwrap(), ["tiles/a"]);
+    }
+
+    #[tokio::test]
+    async fn a_folder_that_is_a_file_cannot_be_opened() {
+        let dir = tempfile::tempdir().unwrap();
+        fs::write(dir.path().join("file"), b"").unwrap();
+        let error = LocalStorage::new(dir.path().join("file")).unwrap_err();
+        assert!(error.to_string().contains("file/.incoming"), "{error}");
+    }
+
+    #[tokio::test]
+    async fn what_is_forbidden_is_denied() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let dir = tempfile::tempdir().unwrap();
+        let storage = LocalStorage::new(dir.path()).unwrap();
+        storage
+            .write_durable("closed/a", Bytes::from_static(b"abc"))
+            .await
+            .unwrap();
+        let closed = dir.path().join("closed");
+        fs::set_permissions(&closed, fs::Permissions::from_mode(0o000)).unwrap();
+        let read = storage.read("closed/a", None).await;
+        let allowed = fs::read_dir(&closed).is_ok();
+        fs::set_permissions(&closed, fs::Permissions::from_mode(0o755)).unwrap();
+        // The superuser may read everything.
+        assert!(
+            allowed || matches!(read, Err(StorageError::Denied { .. })),
+            "{read:?}"
+        );
+    }
+
+    #[test]
+    fn what_the_system_says_is_sorted() {
+        let sorted = |kind: io::ErrorKind| StorageError::new(kind.into(), "n", "p".to_owned());
+        assert!(matches!(
+            sorted(io::ErrorKind::NotFound),
+            StorageError::NotFound { .. }
+        ));
+        assert!(matches!(
+            sorted(io::ErrorKind::StorageFull),
+            StorageError::Full { .. }
+        ));
+        assert!(matches!(
+            sorted(io::ErrorKind::QuotaExceeded),
+            StorageError::Full { .. }
+        ));
+        assert!(matches!(
+            sorted(io::ErrorKind::PermissionDenied),
+            StorageError::Denied { .. }
+        ));
+        assert!(matches!(
+            sorted(io::ErrorKind::ReadOnlyFilesystem),
+            StorageError::Denied { .. }
+        ));
+        assert!(matches!(
+            sorted(io::ErrorKind::TimedOut),
+            StorageError::Io { .. }
+        ));
+        // Error number 28 is what a full disk answers.
+        let full = StorageError::new(io::Error::from_raw_os_error(28), "n", "p".to_owned());
+        assert!(matches!(full, StorageError::Full { .. }) && full.is_transient());
     }
 
     #[tokio::test]
