@@ -55,7 +55,7 @@ pub(crate) fn frame_uniform(
     let flag = |set, flag| if set { flag } else { 0 };
     FrameUniform {
         forward: axes.z_axis.as_vec3(),
-        pixel: pixel as f32,
+        pixel: single(pixel),
         right: (axes.x_axis * tangent * size.x / size.y).as_vec3(),
         level_count: if usable {
             u32::try_from(volume.levels.len()).unwrap_or(0)
@@ -96,12 +96,20 @@ pub(crate) fn transfer_storage(transfer: &TransferFunction) -> TransferStorage {
     let length_nm = transfer.opacity_length_nm.max(f64::MIN_POSITIVE);
     for (index, [r, g, b, opacity]) in transfer.table().into_iter().enumerate() {
         let extinction = -(-f64::from(opacity)).ln_1p() / length_nm;
-        storage.colors[index] = [r, g, b, extinction.min(OPAQUE) as f32];
+        storage.colors[index] = [r, g, b, single(extinction.min(OPAQUE))];
         let opaque = u32::from(storage.colors[index][3] > 0.0);
         storage.opaque_before[index + 1] = storage.opaque_before[index] + opaque;
     }
     debug_assert!(storage.opaque_before[TABLE_LEN] <= 256, "one per entry");
     storage
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the nearest f32 is what is wanted"
+)]
+fn single(value: f64) -> f32 {
+    value as f32
 }
 
 #[cfg(test)]

@@ -132,13 +132,12 @@ mod tests {
         let limits = wgpu::Limits::default();
         let of = |wanted: fn(&naga::GlobalVariable, &naga::TypeInner) -> bool| {
             let globals = module.global_variables.iter();
-            globals
-                .filter(|(_, g)| wanted(g, &module.types[g.ty].inner))
-                .count()
+            let globals = globals.filter(|(_, g)| wanted(g, &module.types[g.ty].inner));
+            u32::try_from(globals.count()).unwrap()
         };
         let buffers = of(|g, _| matches!(g.space, naga::AddressSpace::Storage { .. }));
         assert!(
-            buffers as u32 <= limits.max_storage_buffers_per_shader_stage,
+            buffers <= limits.max_storage_buffers_per_shader_stage,
             "{buffers}"
         );
         let images = of(|_, ty| {
@@ -151,7 +150,7 @@ mod tests {
             )
         });
         assert!(
-            images as u32 <= limits.max_storage_textures_per_shader_stage,
+            images <= limits.max_storage_textures_per_shader_stage,
             "{images}"
         );
     }
@@ -168,14 +167,14 @@ mod tests {
     #[test]
     fn constants_agree() {
         let module = module();
-        let levels = MAX_LEVELS as u32;
+        let [levels, table_len] = [MAX_LEVELS, TABLE_LEN].map(|n| u32::try_from(n).unwrap());
         for (name, value) in [
             ("WORKGROUP", WORKGROUP),
             ("BRICK_EDGE", BRICK_EDGE),
             ("BRICK_BORDER", BRICK_BORDER),
             ("BRICK_STORED_EDGE", BRICK_STORED_EDGE),
             ("MAX_LEVELS", levels),
-            ("TABLE_LEN", TABLE_LEN as u32),
+            ("TABLE_LEN", table_len),
             ("EMPTY", bytemuck::cast(Entry::EMPTY)),
             ("FIRST_SLOT", Entry::FIRST_SLOT),
             ("STALE", Entry::STALE),

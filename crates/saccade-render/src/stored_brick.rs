@@ -1,20 +1,24 @@
+use std::borrow::Cow;
+
 use saccade_core::volume::Polarity;
 
 /// A brick's voxels as the brick cache holds them.
 #[derive(Debug)]
-pub(crate) struct StoredBrick {
+pub(crate) struct StoredBrick<'a> {
     /// With border, x fastest.
-    pub(crate) voxels: Vec<u8>,
+    pub(crate) voxels: Cow<'a, [u8]>,
     /// Smallest and largest, border included: interpolation reaches it.
     pub(crate) range: [u8; 2],
 }
 
-impl StoredBrick {
-    pub(crate) fn new(raw: &[u8], polarity: Polarity) -> Self {
-        let voxels: Vec<u8> = raw.iter().map(|&value| polarity.stored(value)).collect();
-        let range = voxels
-            .iter()
-            .fold([u8::MAX, 0], |[low, high], &v| [low.min(v), high.max(v)]);
+impl<'a> StoredBrick<'a> {
+    pub(crate) fn new(raw: &'a [u8], polarity: Polarity) -> Self {
+        let voxels = match polarity {
+            Polarity::Bright => Cow::Borrowed(raw),
+            Polarity::Dark => raw.iter().map(|&v| Polarity::Dark.stored(v)).collect(),
+        };
+        let values = || voxels.iter().copied();
+        let range = [values().fold(u8::MAX, u8::min), values().fold(0, u8::max)];
         Self { voxels, range }
     }
 }
@@ -26,11 +30,8 @@ mod tests {
     #[test]
     fn ranges_are_of_stored_values() {
         let brick = StoredBrick::new(&[0, 1, 200], Polarity::Dark);
-        assert_eq!(
-            (brick.voxels.as_slice(), brick.range),
-            (&[0, 255, 56][..], [0, 255])
-        );
+        assert_eq!((&*brick.voxels, brick.range), (&[0, 255, 56][..], [0, 255]));
         let brick = StoredBrick::new(&[7, 1, 200], Polarity::Bright);
-        assert_eq!(brick.range, [1, 200]);
+        assert_eq!((&*brick.voxels, brick.range), (&[7, 1, 200][..], [1, 200]));
     }
 }

@@ -1,6 +1,6 @@
 //! The state machine against a plain list of what was delivered.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use glam::{DVec3, UVec3};
 use proptest::prelude::*;
@@ -32,13 +32,13 @@ struct World {
     memory: VirtualMemory,
     levels: Vec<Level>,
     ids: Vec<BrickId>,
-    said: HashMap<BrickId, Said>,
+    said: BTreeMap<BrickId, Said>,
     /// Content per brick slot, as the texture has it.
     texture: HashMap<u32, u32>,
     /// The arrays as the device has them.
     device: [Vec<Entry>; 2],
     /// Slots that the latest report used, and must stay.
-    in_use: HashMap<BrickId, u32>,
+    in_use: BTreeMap<BrickId, u32>,
     next_content: u32,
     refusals: u32,
 }
@@ -65,10 +65,10 @@ impl World {
             memory,
             levels,
             ids,
-            said: HashMap::new(),
+            said: BTreeMap::new(),
             texture: HashMap::new(),
             device,
-            in_use: HashMap::new(),
+            in_use: BTreeMap::new(),
             next_content: 0,
             refusals: 0,
         }
@@ -142,7 +142,7 @@ impl World {
         self.memory.frame_submitted();
         let slots = self.memory.bricks().1 + self.memory.blocks().1;
         let mut usage = vec![0; slots.div_ceil(32) as usize];
-        let mut missed = HashSet::new();
+        let mut missed = BTreeSet::new();
         self.in_use.clear();
         for n in 0..number % 40 {
             let id = self.id(number.wrapping_add(n * 7));
@@ -168,8 +168,6 @@ impl World {
             }
         }
         self.memory.note_usage(frame, &usage);
-        let mut missed: Vec<_> = missed.into_iter().collect();
-        missed.sort_unstable();
         for entry in missed {
             if let Want::Brick(id) = self.memory.want(frame, entry, true) {
                 assert!(

@@ -3,6 +3,9 @@
 //! Without an adapter these tests print so and pass; `SACCADE_GPU_TESTS=require` makes that a
 //! failure. `SACCADE_GPU_TEST_IMAGES=DIR` keeps the pictures.
 
+#![expect(clippy::unwrap_used, reason = "helpers of tests fail as tests do")]
+#![expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
+
 mod behaviour;
 mod harness;
 mod oracle;
