@@ -28,30 +28,33 @@ pub(crate) fn tell(line: &str) {
     drop(writeln!(std::io::stdout(), "{line}"));
 }
 
-/// Shows warnings of our crates and errors of all others; `SACCADE_LOG=debug` shows more.
+/// Shows the warnings of our crates. `SACCADE_LOG=debug`, or another level, shows those of all.
 pub(crate) fn log_to_stderr() {
     let asked = std::env::var("SACCADE_LOG")
         .ok()
         .and_then(|level| level.parse().ok());
     log::set_max_level(asked.unwrap_or(LevelFilter::Warn));
+    let logger = Box::new(StandardError {
+        all: asked.is_some(),
+    });
     // Fails only if there is a logger already: then that one speaks.
-    drop(log::set_logger(&StandardError));
+    drop(log::set_boxed_logger(logger));
 }
 
-struct StandardError;
+struct StandardError {
+    /// Whether others than our crates are heard: drivers complain of much that is harmless.
+    all: bool,
+}
 
 impl Log for StandardError {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        metadata.target().starts_with("saccade") || metadata.level() <= log::Level::Error
+        self.all || metadata.target().starts_with("saccade")
     }
 
     fn log(&self, record: &Record<'_>) {
         if self.enabled(record.metadata()) {
-            say(&format!(
-                "{}: {}",
-                record.level().as_str().to_lowercase(),
-                record.args()
-            ));
+            let level = record.level().as_str().to_lowercase();
+            say(&format!("{level}: {}", record.args()));
         }
     }
 

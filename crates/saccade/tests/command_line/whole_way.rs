@@ -1,0 +1,96 @@
+//! From a microscope's tiles to a picture, through the program alone.
+
+use std::path::Path;
+
+use image::RgbaImage;
+
+use super::{Running, archive, run, saccade, stderr};
+
+/// Pictures of one view agree to a step of 255: where a brick lies in the cache moves roundings.
+const ROUNDING: u8 = 1;
+
+/// The picture; `None` without a GPU, unless `SACCADE_GPU_TESTS=require`.
+fn render(place: &str, to: &Path, more: &[&str]) -> Option<RgbaImage> {
+    let fixed = [
+        "render",
+        place,
+        "-o",
+        to.to_str().unwrap(),
+        "--size",
+        "64x64",
+    ];
+    let output = run(fixed.iter().chain(more));
+    let required = std::env::var("SACCADE_GPU_TESTS").is_ok_and(|v| v == "require");
+    if stderr(&output).contains("no GPU adapter") && !required {
+        eprintln!("skipped: no GPU adapter");
+        return None;
+    }
+    assert!(output.status.success(), "{}", stderr(&output));
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(said.starts_with("complete, level "), "{said}");
+    let picture = image::open(to).unwrap().into_rgba8();
+    assert_eq!(picture.dimensions(), (64, 64));
+    Some(picture)
+}
+
+fn largest_difference(a: &RgbaImage, b: &RgbaImage) -> u8 {
+    let pairs = a.as_raw().iter().zip(b.as_raw());
+    pairs.map(|(a, b)| a.abs_diff(*b)).max().unwrap()
+}
+
+#[test]
+fn from_tissue_to_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let picture = folder.path().join("picture.png");
+    let Some(first) = render(&archive, &picture, &[]) else {
+        return;
+    };
+
+    let lit = first
+        .pixels()
+        .filter(|pixel| pixel.0[..3].iter().any(|v| *v > 40))
+        .count();
+    assert!(lit > 64 * 64 / 20, "only {lit} pixels show anything");
+    assert!(first.pixels().all(|pixel| pixel.0[3] == 255));
+
+    let again = render(&archive, &picture, &[]).unwrap();
+    assert!(largest_difference(&first, &again) <= ROUNDING);
+
+    let (_server, url) = Running::start(saccade().args(["serve", &archive, "--port", "0"]));
+    let remote = render(&url, &picture, &[]).unwrap();
+    assert!(largest_difference(&first, &remote) <= ROUNDING);
+
+    let elsewhere = ["--camera", "-40,10,9000,1200,1000,240"];
+    let other = render(&archive, &picture, &elsewhere).unwrap();
+    assert!(
+        largest_difference(&first, &other) > 40,
+        "the comparison sees no difference"
+    );
+}
+
+#[test]
+fn what_is_not_complete_is_not_written_unless_wanted() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let picture = folder.path().join("picture.png");
+    if render(&archive, &picture, &[]).is_none() {
+        return;
+    }
+    std::fs::remove_file(&picture).unwrap();
+    let late = [
+        "render",
+        &archive,
+        "-o",
+        picture.to_str().unwrap(),
+        "--timeout",
+        "0",
+    ];
+    let output = run(late);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(stderr(&output).contains("--partial"), "{}", stderr(&output));
+    assert!(!picture.exists());
+    let output = run(late.iter().chain(&["--partial"]));
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert!(picture.exists());
+}
