@@ -5,6 +5,9 @@ use glam::DVec3;
 use super::{ColorMap, OpacityPoint, TransferFunction};
 use crate::volume::Polarity;
 
+/// Share of the range of values below which the median means background.
+const BACKGROUND_BELOW: f64 = 0.43;
+
 /// Counts of 8-bit values. Value 0, nothing acquired, is not counted.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Histogram {
@@ -49,18 +52,23 @@ impl Histogram {
         u8::MAX
     }
 
-    /// Where the structures are: the thin tail of the distribution. Membranes are the dark tail of
-    /// bright tissue; labelled cells the bright tail of a dark field.
+    /// Where the structures are. Electron micrographs fill their range of values, bulk in the
+    /// middle or above, and their membranes are dark; a field of labelled cells is mostly
+    /// background near the low end, and what is labelled is bright.
     pub fn polarity(&self) -> Polarity {
-        let [low, middle, high] = [0.02, 0.5, 0.98].map(|p| i32::from(self.percentile(p)));
-        if middle - low > high - middle {
+        let [low, middle, high] = [0.005, 0.5, 0.995].map(|p| f64::from(self.percentile(p)));
+        if middle - low > BACKGROUND_BELOW * (high - low) {
             Polarity::Dark
         } else {
             Polarity::Bright
         }
     }
 
-    /// A transfer function that shows the tail of the distribution and hides its bulk.
+    /// A first transfer function, colours between the 0.5th and 99.5th percentile.
+    ///
+    /// Dense tissue (dark structures) is shown as a block whose faces look like its sections, only
+    /// its brightest parts being translucent; labelled cells (bright structures) are shown in a
+    /// transparent background.
     ///
     /// `size_nm` is the volume's size \[nm\]: opacity is chosen so that a ray sees some depth of a
     /// block and a thin slab is still seen. An empty histogram gives a plain ramp over all values.
@@ -74,15 +82,18 @@ impl Histogram {
         };
         let high = high.max(low + 2.0 / 255.0);
         let point = |value, opacity| OpacityPoint { value, opacity };
-        let opacity = match polarity {
+        let (longest, shortest) = (size_nm.max_element(), size_nm.min_element());
+        let (opacity, opacity_length_nm) = match polarity {
             Polarity::Dark => {
-                let from = unit(self.percentile(0.03)).max(low + 0.5 / 255.0);
-                let to = unit(self.percentile(0.40)).max(from + 1.0 / 255.0);
-                vec![point(from, 0.85), point(to, 0.0)]
+                let from = unit(self.percentile(0.05)).max(low + 0.5 / 255.0);
+                let to = unit(self.percentile(0.97)).max(from + 1.0 / 255.0);
+                let points = vec![point(from, 0.95), point(to, 0.35)];
+                (points, (longest / 128.0).min(shortest / 4.0))
             }
             Polarity::Bright => {
                 let from = unit(self.percentile(0.60)).min(high - 1.5 / 255.0).max(low);
-                vec![point(from, 0.0), point(high, 0.85)]
+                let points = vec![point(from, 0.0), point(high, 0.85)];
+                (points, (longest / 64.0).min(shortest / 2.0))
             }
         };
         TransferFunction {
@@ -90,7 +101,7 @@ impl Histogram {
             color_map: ColorMap::Gray,
             window: [low, high],
             opacity,
-            opacity_length_nm: (size_nm.max_element() / 64.0).min(size_nm.min_element() / 2.0),
+            opacity_length_nm,
         }
     }
 }
@@ -114,8 +125,11 @@ mod tests {
         let em = bell(170.0, 20.0, 80.0);
         let tf = em.transfer_function(DVec3::splat(1000.0));
         assert_eq!(tf.polarity, Polarity::Dark);
-        assert!(tf.opacity_at(80.0 / 255.0) > 0.5, "membranes are seen");
-        assert!(tf.opacity_at(175.0 / 255.0) < 0.05, "cytoplasm is not");
+        let [membrane, cytoplasm] = [80.0, 200.0].map(|v| tf.opacity_at(v / 255.0));
+        assert!(
+            membrane > 0.8 && membrane > 2.0 * cytoplasm,
+            "{membrane} and {cytoplasm}"
+        );
 
         let fluorescence = bell(30.0, 10.0, 160.0);
         let tf = fluorescence.transfer_function(DVec3::splat(1000.0));
