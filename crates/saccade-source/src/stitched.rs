@@ -16,7 +16,8 @@
 //! - The value is interpolated linearly in the pyramid level whose pixels are most like the voxel
 //!   in size, with the tile's edge pixels repeated outward; it is at least 1. Where no tile is: 0.
 //! - Where a voxel is larger than the pixels of a tile's coarsest level, it is the mean of 2 x 2,
-//!   4 x 4, at most 16 x 16 such samples, those that are 0 left out.
+//!   4 x 4, at most 16 x 16 such samples, those that are 0 left out. The largest tile pixels near
+//!   decide how many; where tiles of a section differ in size, it is the same number for all.
 //!
 //! # Changes
 //!
@@ -39,6 +40,7 @@ mod resample;
 mod tiles;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::CatalogError;
@@ -70,6 +72,8 @@ pub struct StitchedOptions {
     pub index_bytes: u64,
     /// Blocks built at a time.
     pub builds: usize,
+    /// How long chunks fail that show a tile which cannot be read, until it is tried again.
+    pub try_again: Duration,
 }
 
 impl Default for StitchedOptions {
@@ -78,6 +82,7 @@ impl Default for StitchedOptions {
             block_bytes: 512 << 20,
             sub_tile_bytes: 256 << 20,
             index_bytes: 64 << 20,
+            try_again: Duration::from_secs(3),
             builds: std::thread::available_parallelism().map_or(2, usize::from),
         }
     }
@@ -162,7 +167,7 @@ impl StitchedSource {
         let inner = Arc::new(Inner {
             grid: BlockGrid::new(&volume),
             blocks: Blocks::new(options.block_bytes),
-            builder: Builder::new(volume.clone(), tiles),
+            builder: Builder::new(volume.clone(), tiles, options.try_again),
             builds: Arc::new(Semaphore::new(options.builds.max(1))),
             changes: Changes::new(VoxelBox::of_size(volume.extent()), entry.revision),
             runtime: Handle::current(),

@@ -17,8 +17,6 @@ use crate::{ChunkId, ValueRange};
 
 /// Voxels of a block, about: whole chunks are taken \[000 §5.2\].
 const BLOCK: UVec3 = UVec3::new(512, 512, 32);
-/// A block with a tile that could not be read is built again after this.
-const TRY_AGAIN: Duration = Duration::from_secs(3);
 
 /// Names a block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -138,8 +136,13 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// Cuts what was built of `voxels`.
-    pub(super) fn cut(voxels: VoxelBox, chunk: UVec3, slices: &[Slice]) -> Self {
+    /// Cuts what was built of `voxels`. Where a tile could not be read, it is good for `try_again`.
+    pub(super) fn cut(
+        voxels: VoxelBox,
+        chunk: UVec3,
+        slices: &[Slice],
+        try_again: Duration,
+    ) -> Self {
         let failed = slices.iter().any(|s| !s.failures.is_empty());
         let size = (voxels.size() + (chunk - 1)) / chunk;
         let chunks: Vec<_> = if failed || slices.iter().any(|s| s.values.is_some()) {
@@ -153,7 +156,7 @@ impl Block {
         Self {
             size,
             chunks: if empty { Vec::new() } else { chunks },
-            until: failed.then(|| Instant::now() + TRY_AGAIN),
+            until: failed.then(|| Instant::now() + try_again),
         }
     }
 

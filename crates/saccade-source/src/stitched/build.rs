@@ -3,6 +3,7 @@
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use futures::future::join_all;
 use futures::stream::{self, StreamExt, TryStreamExt};
@@ -29,6 +30,7 @@ const SECTIONS_AT_ONCE: usize = 4;
 pub(super) struct Builder {
     volume: Arc<Volume>,
     tiles: Arc<Tiles>,
+    try_again: Duration,
     blocks: AtomicU64,
     voxels: AtomicU64,
 }
@@ -40,10 +42,11 @@ struct Part {
 }
 
 impl Builder {
-    pub(super) fn new(volume: Arc<Volume>, tiles: Tiles) -> Self {
+    pub(super) fn new(volume: Arc<Volume>, tiles: Tiles, try_again: Duration) -> Self {
         Self {
             volume,
             tiles: Arc::new(tiles),
+            try_again,
             blocks: AtomicU64::new(0),
             voxels: AtomicU64::new(0),
         }
@@ -84,8 +87,9 @@ impl Builder {
         let slices: Vec<_> = slices.try_collect().await?;
         self.blocks.fetch_add(1, Ordering::Relaxed);
         self.voxels.fetch_add(voxels.voxels(), Ordering::Relaxed);
-        let chunk = grid.chunk();
-        Ok(on_rayon(move || Block::cut(voxels, chunk, &slices)).await)
+        let (chunk, try_again) = (grid.chunk(), self.try_again);
+        let block = on_rayon(move || Block::cut(voxels, chunk, &slices, try_again)).await;
+        Ok(block)
     }
 
     /// Stitches one z of a block.

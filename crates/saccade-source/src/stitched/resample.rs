@@ -188,6 +188,7 @@ mod tests {
         ] {
             let (start, along) = (DVec2::from(start), DVec2::from(along));
             let mut out = [0; 130];
+            let mut shift = 0.0_f64;
             patch.sample(start, along, &mut out);
             for (n, got) in out.iter().enumerate() {
                 let at = start + along * n as f64;
@@ -196,12 +197,9 @@ mod tests {
                     (f64::from(*got) - want).abs() < 0.7,
                     "{at}: {got}, not {want}"
                 );
-                let next = exact(&value, at + DVec2::X);
-                assert!(
-                    (next - want).abs() > 1.0,
-                    "a pixel further would be seen: {at}"
-                );
+                shift = shift.max((exact(&value, at + DVec2::X) - want).abs());
             }
+            assert!(shift > 10.0, "a pixel further would be seen: {shift}");
         }
     }
 

@@ -1,1 +1,291 @@
+mod changes;
+mod failures;
+mod fixture;
+mod oracle;
 
+use std::future::Future;
+use std::time::Duration;
+
+use glam::{DVec3, UVec3};
+use proptest::prelude::*;
+
+use super::StitchedOptions;
+use crate::conformance::check_reading;
+use crate::{Chunk, ChunkId, SourceError, VolumeSource};
+use fixture::{Fixture, chunk_of, difference, expected, read_all, tile};
+
+/// Runs a test with a limit, so that a lost answer fails instead of hanging.
+fn run<T>(test: impl Future<Output = T>) -> T {
+    let mut runtime = tokio::runtime::Builder::new_multi_thread();
+    let runtime = runtime.worker_threads(2).enable_all().build().unwrap();
+    let limited = async { tokio::time::timeout(Duration::from_secs(60), test).await };
+    runtime.block_on(limited).expect("the test ends in time")
+}
+
+/// Where tiles lie: most sections have six, some have none.
+#[derive(Clone, Debug)]
+struct Layout {
+    extent: UVec3,
+    size: (usize, usize),
+    scale: f64,
+    sections: Vec<bool>,
+    jitter: Vec<(f64, f64)>,
+    degrees: Vec<f64>,
+    seed: u64,
+}
+
+fn layouts() -> impl Strategy<Value = Layout> {
+    let (tiles, sections) = (6 * 7, 7);
+    (
+        (150..270_u32, 140..210_u32),
+        (110..190_usize, 90..170_usize),
+        prop_oneof![Just(1.0), Just(0.5), Just(2.0), 0.8..1.25],
+        prop::collection::vec(prop::bool::weighted(0.7), sections),
+        prop::collection::vec((-14.0..14.0, -14.0..14.0), tiles),
+        prop_oneof![
+            prop::collection::vec(Just(0.0), tiles),
+            prop::collection::vec(-5.0..5.0, tiles),
+            prop::collection::vec(-180.0..180.0, tiles),
+        ],
+        any::<u64>(),
+    )
+        .prop_map(
+            |((x, y), size, scale, sections, jitter, degrees, seed)| Layout {
+                extent: UVec3::new(x, y, sections.len() as u32),
+                size,
+                scale,
+                sections,
+                jitter,
+                degrees,
+                seed,
+            },
+        )
+}
+
+async fn lay(layout: &Layout) -> Fixture {
+    let mut fixture = Fixture::new(layout.extent, DVec3::new(4.0, 4.0, 30.0)).await;
+    let mut n = 0;
+    let sections = (0..).zip(&layout.sections).filter(|(_, there)| **there);
+    for (section, _) in sections {
+        for (column, row) in [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)] {
+            let (dx, dy) = layout.jitter[n];
+            let (w, h) = (layout.size.0 as f64, layout.size.1 as f64);
+            let (w, h) = (w * layout.scale, h * layout.scale);
+            // Begins left of and above the volume, overlaps by a tenth, and may leave holes.
+            let x = f64::from(column) * w * 0.9 - 20.0 + dx;
+            let y = f64::from(row) * h * 0.9 - 15.0 + dy;
+            let seed = layout.seed ^ n as u64;
+            let mut tile = tile(
+                layout.size,
+                section,
+                (x, y),
+                layout.degrees[n],
+                layout.scale,
+                seed,
+            );
+            if n % 4 == 3 {
+                // Black corners are nothing where they fill a sub-tile, and a measurement elsewhere.
+                for (at, pixel) in tile.pixels.iter_mut().enumerate() {
+                    if at % layout.size.0 < 128 && at / layout.size.0 < 128 {
+                        *pixel = 0;
+                    }
+                }
+            }
+            let bounds = fixture::bounds(&tile);
+            let extent = layout.extent.as_dvec3();
+            if bounds.2 > 0.0 && bounds.3 > 0.0 && bounds.0 < extent.x && bounds.1 < extent.y {
+                fixture.put(&format!("t{n}"), tile).await;
+            }
+            n += 1;
+        }
+    }
+    fixture
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 10, ..ProptestConfig::default() })]
+    #[test]
+    fn equals_brute_force(layout in layouts()) {
+        run(async {
+            let fixture = lay(&layout).await;
+            let source = fixture.open().await;
+            let (got, want) = (read_all(&source).await, fixture.expected());
+            let (coverage, most) = difference(&got, &want);
+            prop_assert_eq!(coverage, 0);
+            prop_assert!(most <= 1, "{} grey levels", most);
+            Ok(())
+        })?;
+    }
+}
+
+/// Tiles at whole voxels, whose edges and bisectors run through the samples of coarser levels.
+async fn aligned() -> Fixture {
+    let mut fixture = Fixture::new(UVec3::new(700, 150, 40), DVec3::new(4.0, 4.0, 9.0)).await;
+    for section in [0, 1, 2, 5, 33, 39] {
+        for n in 0..3 {
+            let corner = (f64::from(n) * 230.0 - 16.0, 8.0);
+            let seed = u64::from(section * 3 + n);
+            let tile = tile((264, 140), section, corner, 0.0, 1.0, seed);
+            fixture.put(&format!("s{section}n{n}"), tile).await;
+        }
+    }
+    fixture
+}
+
+#[test]
+fn ties_and_edges_are_as_written() {
+    run(async {
+        let fixture = aligned().await;
+        let got = read_all(&fixture.open().await).await;
+        let want = fixture.expected();
+        assert_eq!(got[0], want[0], "at level 0 pixels are voxels");
+        let (coverage, most) = difference(&got, &want);
+        assert_eq!(coverage, 0);
+        assert!(most <= 1, "{most}");
+        assert!(
+            fixture.volume.levels.len() > 4,
+            "levels coarser than the pyramids are compared"
+        );
+    });
+}
+
+#[test]
+fn the_comparison_can_fail() {
+    run(async {
+        let fixture = aligned().await;
+        let got = read_all(&fixture.open().await).await;
+        let compared = |change: &dyn Fn(&mut oracle::RawTile)| {
+            let mut tiles = fixture.tiles.clone();
+            change(tiles.values_mut().next().unwrap());
+            difference(&got, &expected(&fixture.volume, &tiles))
+        };
+        assert!(
+            compared(&|tile| tile.transform[4] += 1.0).1 > 1,
+            "a pixel to the right"
+        );
+        assert!(
+            compared(&|tile| tile.transform[5] -= 0.05).1 > 1,
+            "a twentieth up"
+        );
+        assert!(compared(&|tile| tile.section = 3).0 > 0, "another section");
+        assert!(
+            compared(&|tile| tile.age = 1000).1 > 1,
+            "another winner of ties"
+        );
+        assert!(
+            compared(&|tile| tile.pixels[9_040] ^= 64).1 > 1,
+            "one other pixel"
+        );
+        assert!(compared(&|_| ()).1 <= 1);
+    });
+}
+
+#[test]
+fn conforms() {
+    run(async {
+        let fixture = aligned().await;
+        let want = fixture.expected();
+        let source = fixture.open().await;
+        let oracle = |id| chunk_of(&fixture.volume, &want, id);
+        check_reading(&source, oracle, 1).await.unwrap();
+    });
+}
+
+#[test]
+fn a_block_is_built_once_and_its_sub_tiles_are_decoded_once() {
+    run(async {
+        let fixture = aligned().await;
+        let source = fixture.open().await;
+        let volume = fixture.volume.clone();
+        let all = saccade_core::voxel_box::VoxelBox::of_size(volume.chunks(0)).iter();
+        let ids = all.map(|chunk| ChunkId {
+            channel: 0,
+            level: 0,
+            chunk,
+        });
+        futures::future::try_join_all(ids.map(|id| source.read(id)))
+            .await
+            .unwrap();
+        let statistics = source.statistics();
+        // 700 x 150 x 40 voxels are 2 x 1 x 2 blocks.
+        assert_eq!(statistics.blocks_built, 4);
+        assert_eq!(statistics.voxels_built, 700 * 150 * 40);
+        // Six sections of three tiles of 3 x 2 sub-tiles. The border between blocks is decoded
+        // by one of them, or by both if they are built at the same time.
+        let decoded = statistics.sub_tiles_decoded;
+        assert!(decoded <= 6 * 3 * (6 + 2), "{decoded} sub-tiles");
+        assert!(decoded >= 6 * 3 * 4, "{decoded} sub-tiles");
+        assert_eq!(statistics.tiles_indexed, 18);
+    });
+}
+
+#[test]
+fn nothing_is_decoded_where_nothing_is() {
+    run(async {
+        let mut fixture = Fixture::new(UVec3::new(600, 500, 9), DVec3::new(4.0, 4.0, 30.0)).await;
+        let mut black = tile((300, 200), 2, (10.0, 20.0), 3.0, 1.0, 1);
+        black.pixels.fill(0);
+        fixture.put("black", black).await;
+        let source = fixture.open().await;
+        let got = read_all(&source).await;
+        assert!(got.iter().flatten().all(|v| *v == 0));
+        assert_eq!(source.statistics().sub_tiles_decoded, 0);
+        let id = ChunkId {
+            channel: 0,
+            level: 0,
+            chunk: UVec3::ZERO,
+        };
+        assert_eq!(source.read(id).await.unwrap(), Chunk::Empty);
+    });
+}
+
+#[test]
+fn memory_is_bounded() {
+    run(async {
+        let fixture = aligned().await;
+        let limit = 12 << 20;
+        let options = StitchedOptions {
+            block_bytes: limit,
+            sub_tile_bytes: 1 << 20,
+            index_bytes: 1 << 16,
+            builds: 2,
+            ..StitchedOptions::default()
+        };
+        let source = fixture.open_with(options).await;
+        let got = read_all(&source).await;
+        assert!(source.statistics().block_bytes <= limit);
+        let (coverage, most) = difference(&got, &fixture.expected());
+        assert_eq!((coverage, most <= 1), (0, true));
+    });
+}
+
+#[test]
+fn values_are_within_their_bounds_and_known_after_reading() {
+    run(async {
+        let fixture = aligned().await;
+        let source = fixture.open().await;
+        let id = ChunkId {
+            channel: 0,
+            level: 0,
+            chunk: UVec3::new(1, 1, 0),
+        };
+        assert_eq!(source.value_range(id), None);
+        source.read(id).await.unwrap();
+        let range = source.value_range(id).unwrap();
+        assert_eq!((range.min, range.max), (1, 255), "of noise");
+    });
+}
+
+#[test]
+fn unknown_volumes_are_told() {
+    run(async {
+        let fixture = aligned().await;
+        let error = super::StitchedSource::open(&fixture.archive, "w", StitchedOptions::default());
+        match error.await.map(|_| ()) {
+            Err(SourceError::NoVolume { name, known }) => {
+                assert_eq!((name.as_str(), known), ("w", vec!["v".to_owned()]));
+            }
+            other => panic!("{other:?}"),
+        }
+    });
+}

@@ -1,0 +1,300 @@
+//! What was built before a change is never delivered to whoever reads after it.
+
+use std::cell::RefCell;
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use bytes::Bytes;
+use futures::StreamExt;
+use futures::future::{BoxFuture, Either, FutureExt, select};
+use glam::{DVec3, UVec3};
+use proptest::prelude::*;
+use saccade_archive::storage::{MemoryStorage, Storage, StorageError};
+use saccade_core::voxel_box::VoxelBox;
+use tokio::sync::watch;
+
+use super::fixture::{Fixture, Levels, bounds, chunk_of, difference, read_all, tile};
+use super::oracle::RawTile;
+use super::run;
+use crate::conformance::check_changes;
+use crate::stitched::StitchedSource;
+use crate::{Chunk, ChunkId, VolumeSource};
+
+const FIRST: ChunkId = ChunkId {
+    channel: 0,
+    level: 0,
+    chunk: UVec3::ZERO,
+};
+
+async fn small(storage: Arc<dyn Storage>) -> Fixture {
+    let extent = UVec3::new(140, 100, 5);
+    let mut fixture = Fixture::on(storage, extent, DVec3::new(4.0, 4.0, 30.0)).await;
+    for (n, section) in (0..).zip([0, 0, 2]) {
+        let corner = (f64::from(n % 2) * 60.0 - 5.0, -8.0);
+        let tile = tile((80, 130), section, corner, 2.0, 1.0, u64::from(section) + 7);
+        fixture.put(&format!("t{n}"), tile).await;
+    }
+    fixture
+}
+
+/// The level-0 voxels that a tile touches.
+fn place(fixture: &Fixture, tile: &RawTile) -> VoxelBox {
+    let (x0, y0, x1, y1) = bounds(tile);
+    let z = f64::from(tile.section);
+    let place = VoxelBox::around(DVec3::new(x0, y0, z), DVec3::new(x1, y1, z + 1.0));
+    place.intersection(VoxelBox::of_size(fixture.volume.extent()))
+}
+
+#[test]
+fn every_kind_of_change_is_told_and_seen() {
+    run(async {
+        let mut fixture = small(Arc::new(MemoryStorage::new())).await;
+        let source = fixture.open().await;
+        let volume = fixture.volume.clone();
+        let now: RefCell<Levels> = RefCell::new(fixture.expected());
+        let mut n = 0;
+        let change = async || {
+            n += 1;
+            let seed = 100 + n;
+            let near = tile((80, 130), 0, (-5.0, -8.0), 2.0, 1.0, seed);
+            let moved = |corner, degrees| tile((80, 130), 0, corner, degrees, 1.0, 0).transform;
+            let touched = match n {
+                // Imaged again: same place, other pixels; then another size and section.
+                1 => ("t0", Ok(near)),
+                2 => ("t0", Ok(tile((60, 135), 3, (10.0, 5.0), -9.0, 1.0, seed))),
+                // New, in a section that had none.
+                3 => ("t7", Ok(tile((90, 140), 4, (30.0, 20.0), 50.0, 1.0, seed))),
+                // Moved a little, and far.
+                4 => ("t1", Err(moved((56.0, -7.5), 2.5))),
+                5 => ("t1", Err(moved((-30.0, 40.0), 95.0))),
+                _ => ("t2", Err(moved((61.0, -20.0), 0.0))),
+            };
+            let touched = match touched {
+                (name, Ok(tile)) => {
+                    let place = place(&fixture, &tile);
+                    fixture.put(name, tile).await;
+                    place
+                }
+                (name, Err(transform)) => {
+                    fixture.transform(name, transform).await;
+                    let moved = fixture.tiles.values().find(|t| t.transform == transform);
+                    place(&fixture, moved.unwrap())
+                }
+            };
+            *now.borrow_mut() = fixture.expected();
+            touched
+        };
+        let oracle = |id| chunk_of(&volume, &now.borrow(), id);
+        check_changes(&source, 6, change, oracle, 1).await.unwrap();
+    });
+}
+
+#[derive(Clone, Debug)]
+enum Step {
+    Put(usize, u32, (f64, f64), f64, u64),
+    Move(usize, (f64, f64), f64),
+    Read(usize),
+    /// Begins to read and gives up.
+    Drop(usize),
+}
+
+fn steps() -> impl Strategy<Value = Vec<Step>> {
+    let corner = || (-60.0..120.0, -70.0..90.0);
+    let step = prop_oneof![
+        (0..5_usize, 0..5_u32, corner(), -40.0..40.0, any::<u64>())
+            .prop_map(|(n, z, at, turn, seed)| Step::Put(n, z, at, turn, seed)),
+        (0..5_usize, corner(), -40.0..40.0).prop_map(|(n, at, turn)| Step::Move(n, at, turn)),
+        (0..64_usize).prop_map(Step::Read),
+        (0..64_usize).prop_map(Step::Drop),
+    ];
+    prop::collection::vec(step, 4..24)
+}
+
+/// Waits until the source knows all that the catalog does.
+async fn caught_up(
+    fixture: &Fixture,
+    changes: &mut crate::maybe_send::BoxStream<'_, crate::Change>,
+) {
+    let newest = fixture.archive.catalog().revision("v").await.unwrap();
+    while changes.next().await.unwrap().revision < newest {}
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 8, ..ProptestConfig::default() })]
+    #[test]
+    fn nothing_stale_remains(steps in steps()) {
+        run(async {
+            let mut fixture = small(Arc::new(MemoryStorage::new())).await;
+            let source = fixture.open().await;
+            let mut changes = source.changes();
+            let volume = fixture.volume.clone();
+            let ids: Vec<_> = (0..).zip(&volume.levels).flat_map(|(level, _)| {
+                let chunks = VoxelBox::of_size(volume.chunks(level as usize));
+                chunks.iter().map(move |chunk| ChunkId { channel: 0, level, chunk })
+            }).collect();
+            read_all(&source).await;
+            let mut changed = false;
+            for step in steps {
+                match step {
+                    Step::Put(n, z, at, turn, seed) => {
+                        fixture.put(&format!("t{n}"), tile((80, 130), z, at, turn, 1.0, seed)).await;
+                        changed = true;
+                    }
+                    Step::Move(n, at, turn) => {
+                        let name = format!("t{n}");
+                        let catalog = fixture.archive.catalog();
+                        if catalog.tile("v", &name).await.unwrap().is_some() {
+                            let to = tile((80, 130), 0, at, turn, 1.0, 0).transform;
+                            fixture.transform(&name, to).await;
+                            changed = true;
+                        }
+                    }
+                    Step::Read(n) => drop(source.read(ids[n % ids.len()]).await.unwrap()),
+                    Step::Drop(n) => drop(source.read(ids[n % ids.len()]).now_or_never()),
+                }
+            }
+            if changed {
+                caught_up(&fixture, &mut changes).await;
+            }
+            let (old, fresh) = (read_all(&source).await, read_all(&fixture.open().await).await);
+            prop_assert!(old == fresh, "stale voxels");
+            let (coverage, most) = difference(&fresh, &fixture.expected());
+            prop_assert_eq!((coverage, most <= 1), (0, true));
+            Ok(())
+        })?;
+    }
+}
+
+/// Holds reads back until it is opened.
+#[derive(Debug)]
+struct Gate {
+    inner: MemoryStorage,
+    open: watch::Sender<bool>,
+    waiting: AtomicUsize,
+}
+
+impl Gate {
+    fn new() -> Arc<Self> {
+        Arc::new(Self {
+            inner: MemoryStorage::new(),
+            open: watch::Sender::new(true),
+            waiting: AtomicUsize::new(0),
+        })
+    }
+
+    /// Waits until somebody waits.
+    async fn approached(&self, by: usize) {
+        while self.waiting.load(Ordering::SeqCst) < by {
+            tokio::time::sleep(std::time::Duration::from_millis(2)).await;
+        }
+    }
+}
+
+impl Storage for Gate {
+    fn read<'a>(
+        &'a self,
+        name: &'a str,
+        range: Option<Range<u64>>,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        Box::pin(async move {
+            let mut open = self.open.subscribe();
+            if !*open.borrow_and_update() {
+                self.waiting.fetch_add(1, Ordering::SeqCst);
+                open.wait_for(|open| *open).await.unwrap();
+            }
+            self.inner.read(name, range).await
+        })
+    }
+
+    fn write_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<(), StorageError>> {
+        self.inner.write_durable(name, bytes)
+    }
+
+    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
+        self.inner.list(prefix)
+    }
+
+    fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
+        self.inner.delete(name)
+    }
+
+    fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
+        self.inner.size(name)
+    }
+}
+
+async fn read_first(source: &StitchedSource) -> Vec<u8> {
+    match source.read(FIRST).await.unwrap() {
+        Chunk::Voxels(bytes) => bytes.to_vec(),
+        Chunk::Empty => Vec::new(),
+    }
+}
+
+#[test]
+fn a_build_from_before_a_change_serves_only_those_who_asked_before() {
+    run(async {
+        let gate = Gate::new();
+        let mut fixture = small(gate.clone()).await;
+        let source = Arc::new(fixture.open().await);
+        let mut changes = source.changes();
+        let before = chunk_of(&fixture.volume, &fixture.expected(), FIRST);
+        gate.open.send_replace(false);
+        let ask = || {
+            let source = source.clone();
+            tokio::spawn(async move { read_first(&source).await })
+        };
+        let asked_before = ask();
+        gate.approached(1).await;
+        let first = gate.waiting.load(Ordering::SeqCst);
+        let other = tile((80, 130), 0, (-5.0, -8.0), 2.0, 1.0, 99);
+        fixture.put("t0", other).await;
+        caught_up(&fixture, &mut changes).await;
+        let after = chunk_of(&fixture.volume, &fixture.expected(), FIRST);
+        let asked_after = ask();
+        gate.approached(first + 1).await;
+        gate.open.send_replace(true);
+
+        let close = |got: &[u8], want: &[u8]| {
+            got.iter().zip(want).all(|(a, b)| a.abs_diff(*b) <= 1) && got.len() == want.len()
+        };
+        assert!(close(&asked_before.await.unwrap(), &before));
+        assert!(close(&asked_after.await.unwrap(), &after));
+        assert!(
+            close(&read_first(&source).await, &after),
+            "the older build was not kept"
+        );
+        assert!(!close(&before, &after), "the change can be seen");
+        assert_eq!(source.statistics().blocks_built, 2);
+    });
+}
+
+#[test]
+fn a_build_that_nobody_waits_for_ends() {
+    run(async {
+        let gate = Gate::new();
+        let fixture = small(gate.clone()).await;
+        let source = fixture.open().await;
+        gate.open.send_replace(false);
+        let (one, other) = (source.read(FIRST), source.read(FIRST));
+        let both = futures::future::join(one, other);
+        let waiting = std::pin::pin!(gate.approached(1));
+        match select(both, waiting).await {
+            Either::Left(_) => panic!("read through a closed gate"),
+            Either::Right(((), both)) => drop(both),
+        }
+        gate.open.send_replace(true);
+        let want = chunk_of(&fixture.volume, &fixture.expected(), FIRST);
+        let got = read_first(&source).await;
+        assert!(got.iter().zip(&want).all(|(a, b)| a.abs_diff(*b) <= 1));
+        assert_eq!(
+            source.statistics().blocks_built,
+            1,
+            "the first build was given up"
+        );
+    });
+}

@@ -1,0 +1,166 @@
+//! A tile that cannot be read fails the chunks it is seen in, and nothing else.
+
+use std::error::Error;
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures::StreamExt;
+use glam::{DVec3, UVec3};
+use saccade_archive::image::GrayImage;
+use saccade_archive::pyramid::{Encoding, encode};
+
+use super::fixture::{Fixture, chunk_of, tile};
+use super::run;
+use crate::stitched::{StitchError, StitchedOptions};
+use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
+
+/// Two tiles side by side that do not touch, seen in chunks of their own.
+async fn two() -> (Fixture, String) {
+    let mut fixture = Fixture::new(UVec3::new(256, 64, 3), DVec3::new(4.0, 4.0, 30.0)).await;
+    let left = fixture
+        .put("left", tile((120, 64), 1, (0.0, 0.0), 0.0, 1.0, 5))
+        .await;
+    fixture
+        .put("right", tile((120, 64), 1, (130.0, 0.0), 0.0, 1.0, 6))
+        .await;
+    (fixture, left)
+}
+
+fn id(x: u32) -> ChunkId {
+    ChunkId {
+        channel: 0,
+        level: 0,
+        chunk: UVec3::new(x, 0, 0),
+    }
+}
+
+/// The error with all its causes, as a user sees it.
+fn text(error: &ChunkError) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(error) = source {
+        text = format!("{text}: {error}");
+        source = error.source();
+    }
+    text
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Harm {
+    Missing,
+    Garbage,
+    Cut,
+    NoIndex,
+    OtherSize,
+}
+
+#[test]
+fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
+    for (harm, transient) in [
+        (Harm::Missing, true),
+        (Harm::Garbage, false),
+        (Harm::Cut, false),
+        (Harm::NoIndex, false),
+        (Harm::OtherSize, false),
+    ] {
+        run(async {
+            let (mut fixture, left) = two().await;
+            let whole = fixture.storage.read(&left, None).await.unwrap();
+            let harmed = match harm {
+                Harm::Missing => None,
+                Harm::Garbage => {
+                    let mut bytes = whole.to_vec();
+                    let middle = bytes.len() * 2 / 3;
+                    bytes[middle..].fill(0xff);
+                    Some(Bytes::from(bytes))
+                }
+                Harm::Cut => Some(whole.slice(..whole.len() * 2 / 3)),
+                Harm::NoIndex => Some(Bytes::from_static(b"II*\0 this is no pyramid")),
+                Harm::OtherSize => {
+                    let image = GrayImage::new(64, 50, vec![9; 64 * 50]);
+                    Some(encode(&image, &Encoding::Lossless).unwrap())
+                }
+            };
+            match harmed {
+                None => fixture.storage.delete(&left).await.unwrap(),
+                Some(bytes) => fixture.storage.write_durable(&left, bytes).await.unwrap(),
+            }
+            let source = fixture.open().await;
+            let want = fixture.expected();
+            for x in [0, 1] {
+                let error = source.read(id(x)).await.unwrap_err();
+                let told = text(&error);
+                assert!(told.contains(&left), "{harm:?}: {told}");
+                assert_eq!(error.is_transient(), transient, "{harm:?}: {told}");
+                let ChunkError::Failed { source, .. } = error else {
+                    panic!("{told}");
+                };
+                let size = matches!(source.downcast_ref(), Some(StitchError::Size { .. }));
+                assert_eq!(size, harm == Harm::OtherSize, "{told}");
+            }
+            for x in [2, 3] {
+                match source.read(id(x)).await.unwrap() {
+                    Chunk::Voxels(bytes) => {
+                        assert_eq!(bytes, chunk_of(&fixture.volume, &want, id(x)))
+                    }
+                    Chunk::Empty => panic!("chunk {x} is empty"),
+                }
+            }
+
+            let mut changes = source.changes();
+            fixture
+                .put("left", tile((120, 64), 1, (0.0, 0.0), 0.0, 1.0, 7))
+                .await;
+            changes.next().await.unwrap();
+            let want = chunk_of(&fixture.volume, &fixture.expected(), id(0));
+            assert_eq!(
+                source.read(id(0)).await.unwrap(),
+                Chunk::Voxels(want.into())
+            );
+        });
+    }
+}
+
+#[test]
+fn a_tile_that_could_not_be_read_is_tried_again() {
+    run(async {
+        let (fixture, left) = two().await;
+        let whole = fixture.storage.read(&left, None).await.unwrap();
+        fixture.storage.delete(&left).await.unwrap();
+        let options = StitchedOptions {
+            try_again: Duration::from_millis(30),
+            ..StitchedOptions::default()
+        };
+        let source = fixture.open_with(options).await;
+        assert!(source.read(id(0)).await.is_err());
+        fixture.storage.write_durable(&left, whole).await.unwrap();
+        while source.read(id(0)).await.is_err() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        let built = source.statistics().blocks_built;
+        assert!(source.read(id(0)).await.is_ok());
+        assert_eq!(source.statistics().blocks_built, built, "now it is kept");
+    });
+}
+
+#[test]
+fn volumes_of_other_kinds_are_refused() {
+    run(async {
+        let (fixture, _) = two().await;
+        let mut volume = fixture.volume.clone();
+        volume.name = "two".into();
+        volume.channels.push("more".into());
+        fixture
+            .archive
+            .catalog()
+            .create_volume(&volume)
+            .await
+            .unwrap();
+        let opened = crate::stitched::StitchedSource::open;
+        let error = opened(&fixture.archive, "two", StitchedOptions::default())
+            .await
+            .err();
+        let told = error.map(|e| e.source().unwrap().to_string()).unwrap();
+        assert!(told.contains("one 8-bit channel"), "{told}");
+    });
+}

@@ -1,0 +1,227 @@
+//! An archive in memory (but for the catalog) and a list of what is in it.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use glam::{DVec3, UVec2, UVec3};
+use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::{Catalog, NewTile};
+use saccade_archive::image::GrayImage;
+use saccade_archive::pyramid::{Encoding, encode};
+use saccade_archive::storage::{MemoryStorage, Storage};
+use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+
+use super::oracle::{RawTile, stitch};
+use crate::stitched::{StitchedOptions, StitchedSource};
+use crate::{Chunk, ChunkId, VolumeSource};
+
+pub(super) struct Fixture {
+    pub(super) volume: Volume,
+    pub(super) archive: VisualizationArchive,
+    pub(super) storage: Arc<dyn Storage>,
+    /// By id in the catalog.
+    pub(super) tiles: BTreeMap<i64, RawTile>,
+    changes: u64,
+    _folder: tempfile::TempDir,
+}
+
+/// Whole levels, as a source or the oracle has them.
+pub(super) type Levels = Vec<Vec<u8>>;
+
+impl Fixture {
+    pub(super) async fn new(extent: UVec3, voxel_nm: DVec3) -> Self {
+        Self::on(Arc::new(MemoryStorage::new()), extent, voxel_nm).await
+    }
+
+    pub(super) async fn on(storage: Arc<dyn Storage>, extent: UVec3, voxel_nm: DVec3) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let catalog = Catalog::create(&folder.path().join("catalog.sqlite"))
+            .await
+            .unwrap();
+        let volume = Volume::new("v", extent, voxel_nm).unwrap();
+        catalog.create_volume(&volume).await.unwrap();
+        Self {
+            volume,
+            archive: VisualizationArchive::from_parts(catalog, storage.clone()),
+            storage,
+            tiles: BTreeMap::new(),
+            changes: 0,
+            _folder: folder,
+        }
+    }
+
+    pub(super) async fn open(&self) -> StitchedSource {
+        self.open_with(StitchedOptions::default()).await
+    }
+
+    pub(super) async fn open_with(&self, options: StitchedOptions) -> StitchedSource {
+        StitchedSource::open(&self.archive, "v", options)
+            .await
+            .unwrap()
+    }
+
+    /// Enters a tile, new or again, as ingest does. Returns the name of its pyramid.
+    pub(super) async fn put(&mut self, name: &str, mut tile: RawTile) -> String {
+        self.changes += 1;
+        tile.age = self.changes;
+        let size = UVec2::new(tile.width as u32, tile.height as u32);
+        let image = GrayImage::new(size.x, size.y, tile.pixels.clone());
+        let pyramid = format!("tiles/{name}-{}.tif", self.changes);
+        let bytes = encode(&image, &Encoding::Lossless).unwrap();
+        self.storage.write_durable(&pyramid, bytes).await.unwrap();
+        let new = NewTile {
+            name: name.into(),
+            section: tile.section,
+            size,
+            transform: SectionFromTile::new(tile.transform).unwrap(),
+            pyramid: pyramid.clone(),
+            position: self.changes,
+        };
+        self.archive.catalog().commit_tile("v", &new).await.unwrap();
+        let entered = self
+            .archive
+            .catalog()
+            .tile("v", name)
+            .await
+            .unwrap()
+            .unwrap();
+        self.tiles.insert(entered.id.0, tile);
+        pyramid
+    }
+
+    /// Moves a tile.
+    pub(super) async fn transform(&mut self, name: &str, transform: [f64; 6]) {
+        self.changes += 1;
+        let catalog = self.archive.catalog();
+        let moved = SectionFromTile::new(transform).unwrap();
+        let mut commit = catalog.begin("v").await.unwrap();
+        commit
+            .transform(name, moved, Some(self.changes))
+            .await
+            .unwrap();
+        commit.finish().await.unwrap();
+        let id = catalog.tile("v", name).await.unwrap().unwrap().id.0;
+        let tile = self.tiles.get_mut(&id).unwrap();
+        (tile.transform, tile.age) = (transform, self.changes);
+    }
+
+    /// All voxels as they should be.
+    pub(super) fn expected(&self) -> Levels {
+        expected(&self.volume, &self.tiles)
+    }
+}
+
+pub(super) fn expected(volume: &Volume, tiles: &BTreeMap<i64, RawTile>) -> Levels {
+    let levels = volume.levels.iter();
+    let levels = levels.map(|l| stitch(tiles, l.extent.to_array(), l.downsampling.to_array()));
+    levels.collect()
+}
+
+/// All voxels as a source delivers them.
+pub(super) async fn read_all(source: &StitchedSource) -> Levels {
+    let volume = source.volume().clone();
+    let mut levels = Vec::new();
+    for (number, level) in (0..).zip(&volume.levels) {
+        let extent = level.extent.as_usizevec3();
+        let mut values = vec![0; extent.element_product()];
+        for chunk in VoxelBox::of_size(volume.chunks(number as usize)).iter() {
+            let id = ChunkId {
+                channel: 0,
+                level: number,
+                chunk,
+            };
+            let Chunk::Voxels(bytes) = source.read(id).await.unwrap() else {
+                continue;
+            };
+            let voxels = id.voxels(&volume).unwrap();
+            for voxel in voxels.iter() {
+                let from = (voxel - voxels.min).as_usizevec3();
+                let size = volume.chunk.as_usizevec3();
+                let from = (from.z * size.y + from.y) * size.x + from.x;
+                let to = voxel.as_usizevec3();
+                let to = (to.z * extent.y + to.y) * extent.x + to.x;
+                values[to] = bytes[from];
+            }
+        }
+        levels.push(values);
+    }
+    levels
+}
+
+/// A chunk cut out of whole levels.
+pub(super) fn chunk_of(volume: &Volume, levels: &Levels, id: ChunkId) -> Vec<u8> {
+    let extent = volume.levels[id.level as usize].extent;
+    let voxels = VoxelBox::of_size(volume.chunk).iter();
+    let value = |offset: UVec3| {
+        let v = id.chunk * volume.chunk + offset;
+        if v.cmpge(extent).any() {
+            return 0;
+        }
+        let (v, extent) = (v.as_usizevec3(), extent.as_usizevec3());
+        levels[id.level as usize][(v.z * extent.y + v.y) * extent.x + v.x]
+    };
+    voxels.map(value).collect()
+}
+
+/// How two volumes differ: voxels of which one is 0 and the other is not, and the largest
+/// difference of all others.
+pub(super) fn difference(got: &Levels, want: &Levels) -> (usize, u8) {
+    let pairs = || got.iter().flatten().zip(want.iter().flatten());
+    assert_eq!(pairs().count(), want.iter().flatten().count());
+    let coverage = pairs().filter(|(a, b)| (**a == 0) != (**b == 0)).count();
+    let both = pairs().filter(|(a, b)| **a != 0 && **b != 0);
+    (
+        coverage,
+        both.map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0),
+    )
+}
+
+/// Pixels that no shift leaves alike; from a seed.
+pub(super) fn noise(width: usize, height: usize, seed: u64) -> Vec<u8> {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let pixels = (0..width * height).map(|_| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state >> 56) as u8
+    });
+    pixels.collect()
+}
+
+/// A tile of noise turned about its centre, with its low corner moved to (x, y) before turning.
+pub(super) fn tile(
+    size: (usize, usize),
+    section: u32,
+    corner: (f64, f64),
+    degrees: f64,
+    scale: f64,
+    seed: u64,
+) -> RawTile {
+    let (s, c) = degrees.to_radians().sin_cos();
+    let (s, c) = (s * scale, c * scale);
+    let (w, h) = (size.0 as f64 / 2.0, size.1 as f64 / 2.0);
+    let (cx, cy) = (corner.0 + w, corner.1 + h);
+    RawTile {
+        width: size.0,
+        height: size.1,
+        pixels: noise(size.0, size.1, seed),
+        transform: [c, s, -s, c, cx - (c * w - s * h), cy - (s * w + c * h)],
+        section,
+        age: 0,
+    }
+}
+
+/// Low and high corner of a tile in its section.
+pub(super) fn bounds(tile: &RawTile) -> (f64, f64, f64, f64) {
+    let [a, b, c, d, tx, ty] = tile.transform;
+    let (w, h) = (tile.width as f64, tile.height as f64);
+    let corners = [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)];
+    let corners = corners.map(|(x, y)| (a * x + c * y + tx, b * x + d * y + ty));
+    corners
+        .iter()
+        .fold((f64::MAX, f64::MAX, f64::MIN, f64::MIN), |m, p| {
+            (m.0.min(p.0), m.1.min(p.1), m.2.max(p.0), m.3.max(p.1))
+        })
+}
