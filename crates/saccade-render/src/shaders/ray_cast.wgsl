@@ -200,12 +200,14 @@ fn trace(pixel: vec2u) -> vec3f {
                     let at = (corner + in_brick) * texel;
                     let stored = textureSampleLevel(bricks, bricks_sampler, at, 0.0).r;
                     var color = color_of(stored);
-                    if false_colors && distance != 0 {
-                        color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
+                    if color.a > 0.0 {
+                        if false_colors && distance != 0 {
+                            color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
+                        }
+                        let opacity = opacity_of_length(color.a, max(segment, 0.0) * nm_per_depth);
+                        light += transmitted * opacity * color.rgb;
+                        transmitted *= 1.0 - opacity;
                     }
-                    let opacity = opacity_of_length(color.a, max(segment, 0.0) * nm_per_depth);
-                    light += transmitted * opacity * color.rgb;
-                    transmitted *= 1.0 - opacity;
                     samples += 1u;
                 }
             }
