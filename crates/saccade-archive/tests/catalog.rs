@@ -1,5 +1,8 @@
 //! What the catalog promises: order, revisions, boxes, all or nothing, several processes.
 
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+#![expect(clippy::cast_possible_truncation, reason = "small whole numbers")]
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::{Duration, SystemTime};

@@ -254,6 +254,23 @@ mod tests {
         conformance::check(Arc::new(storage())).await;
     }
 
+    /// A suite that cannot fail proves nothing.
+    #[tokio::test]
+    #[should_panic(expected = "Some(0..10)")]
+    async fn the_suite_notices_a_read_cut_short() {
+        let storage = storage();
+        storage.fail_read(2, ReadFault::CutShort { kept: 3 });
+        conformance::check(Arc::new(storage)).await;
+    }
+
+    #[tokio::test]
+    #[should_panic(expected = "write")]
+    async fn the_suite_notices_a_write_that_fails() {
+        let storage = storage();
+        storage.fail_write(3, WriteFault::Fail);
+        conformance::check(Arc::new(storage)).await;
+    }
+
     #[tokio::test]
     async fn writes_fail_as_ordered() {
         for (fault, after) in [
