@@ -89,6 +89,44 @@ impl Budget {
     }
 }
 
+/// What speaks for and against drawing now.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Pace {
+    /// The view is not the one last drawn: somebody waits for it.
+    pub(crate) view_changed: bool,
+    /// Bricks arrived, or changed, since the last picture.
+    pub(crate) data_changed: bool,
+    /// Bricks are still on their way.
+    pub(crate) more_to_come: bool,
+    /// Nobody watches: only the finished picture counts.
+    pub(crate) unwatched: bool,
+    /// When the last picture was known to be finished, and how long it took.
+    pub(crate) last: Option<(Duration, Duration)>,
+}
+
+impl Pace {
+    const LONGEST: Duration = Duration::from_secs(1);
+    /// Unwatched, so many times the last picture's time is worth saving a picture.
+    const PATIENCE: u32 = 4;
+
+    /// From when on to draw; `None` for no need to.
+    ///
+    /// A picture that a few more bricks will outdate at once is put off for as long as the last
+    /// one took: so at least half of a slow GPU is left to others, the user interface first.
+    pub(crate) fn draws_at(self) -> Option<Duration> {
+        if self.view_changed || (self.data_changed && !self.more_to_come) {
+            return Some(Duration::ZERO);
+        }
+        let (end, took) = self.last.unwrap_or_default();
+        let rest = if self.unwatched {
+            took * Self::PATIENCE
+        } else {
+            took.min(Self::LONGEST)
+        };
+        self.data_changed.then_some(end + rest)
+    }
+}
+
 /// When a histogram is computed anew while data arrive.
 ///
 /// The first one at once, later ones at growing distances; the last change is always followed by
@@ -190,6 +228,77 @@ mod tests {
                 allows,
                 "{spent} + {bytes} at {now}"
             );
+        }
+    }
+
+    #[test]
+    fn pictures_are_drawn_when_they_are_worth_it() {
+        let none = Pace {
+            last: Some((ms(500), ms(80))),
+            ..Pace::default()
+        };
+        let new_view = Pace {
+            view_changed: true,
+            ..none
+        };
+        let all_here = Pace {
+            data_changed: true,
+            ..none
+        };
+        let some_here = Pace {
+            more_to_come: true,
+            ..all_here
+        };
+        for (pace, draws_at) in [
+            (none, None),
+            (
+                Pace {
+                    more_to_come: true,
+                    ..none
+                },
+                None,
+            ),
+            (new_view, Some(ms(0))),
+            (
+                Pace {
+                    more_to_come: true,
+                    unwatched: true,
+                    ..new_view
+                },
+                Some(ms(0)),
+            ),
+            (all_here, Some(ms(0))),
+            (
+                Pace {
+                    unwatched: true,
+                    ..all_here
+                },
+                Some(ms(0)),
+            ),
+            (some_here, Some(ms(580))),
+            (
+                Pace {
+                    unwatched: true,
+                    ..some_here
+                },
+                Some(ms(820)),
+            ),
+            (
+                Pace {
+                    last: Some((ms(500), ms(9_000))),
+                    ..some_here
+                },
+                Some(ms(1_500)),
+            ),
+            (
+                Pace {
+                    last: None,
+                    ..some_here
+                },
+                Some(ms(0)),
+            ),
+        ] {
+            assert_eq!(pace.draws_at(), draws_at, "{pace:?}");
         }
     }
 

@@ -426,6 +426,11 @@ impl Pull {
         }
     }
 
+    /// Whether bricks are on their way that were not delivered yet.
+    pub fn has_more(&self) -> bool {
+        self.wanted.iter().any(|&brick| !self.has_failed(brick))
+    }
+
     /// Memory that chunks take \[bytes\]. One that is both being loaded and kept counts twice, though
     /// it is there once.
     pub fn host_bytes(&self) -> u64 {

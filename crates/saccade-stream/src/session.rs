@@ -16,7 +16,7 @@ use saccade_render::{
 use saccade_source::VolumeSource;
 
 use crate::clock::Clock;
-use crate::policy::{Limits, Refresh, Retry};
+use crate::policy::{Limits, Pace, Refresh, Retry};
 use crate::pull::{Progress, Pull};
 use crate::requests::{Event, Requests};
 
@@ -148,6 +148,8 @@ pub struct Session {
     revision: u64,
     frame_time: Option<Duration>,
     frame_size: UVec2,
+    /// When that frame was known.
+    known_at: Option<Duration>,
 }
 
 struct Submitted {
@@ -214,6 +216,7 @@ impl Session {
             revision,
             frame_time: None,
             frame_size: UVec2::ZERO,
+            known_at: None,
         })
     }
 
@@ -246,6 +249,8 @@ impl Session {
     pub fn set_transfer_function(&mut self, transfer: TransferFunction) {
         self.transfer_is_automatic = false;
         self.put_transfer_function(transfer);
+        // Somebody waits for it, as for another view.
+        self.drawn_view = None;
     }
 
     /// Lets colours and opacities follow the histogram, as they do at first.
@@ -265,11 +270,17 @@ impl Session {
     /// Takes what arrived, asks for what is missing, draws if the picture would change.
     pub fn frame(&mut self, view: &View) -> Status {
         let reports = self.renderer.poll();
-        self.advance(view, reports)
+        self.advance(view, reports, false)
     }
 
-    /// [`Self::frame`] with the reports of frames that are finished.
-    pub(crate) fn advance(&mut self, view: &View, reports: Vec<FrameReport>) -> Status {
+    /// [`Self::frame`] with the reports of frames that are finished. Unwatched, pictures
+    /// that are not the last are mostly left out.
+    pub(crate) fn advance(
+        &mut self,
+        view: &View,
+        reports: Vec<FrameReport>,
+        unwatched: bool,
+    ) -> Status {
         let now = self.clock.now();
         self.take_events(now);
         for report in reports {
@@ -283,20 +294,42 @@ impl Session {
         // Delivered bricks make room for others' chunks.
         self.requests.apply(self.pull.plan(now));
 
-        self.dirty |= self.drawn_view != Some(*view);
+        let draws_at = self.pace(view, unwatched).draws_at();
         let free = self.pending.len() < self.frames_in_flight;
-        let drew = self.dirty && free && view.size.min_element() > 0;
+        let drew = free && draws_at.is_some_and(|at| at <= now);
         if drew {
-            self.drawn = self.renderer.render(view);
-            self.drawn_view = Some(*view);
-            self.pending.push_back(Submitted {
-                frame: self.drawn,
-                at: now,
-                size: view.size,
-            });
-            self.dirty = false;
+            self.draw(view, now);
         }
-        self.status(now, drew, cut)
+        self.dirty |= self.drawn_view != Some(*view);
+        self.status(now, drew, cut, draws_at.filter(|_| !drew))
+    }
+
+    fn pace(&self, view: &View, unwatched: bool) -> Pace {
+        let visible = view.size.min_element() > 0;
+        Pace {
+            view_changed: visible && self.drawn_view != Some(*view),
+            data_changed: visible && self.dirty,
+            more_to_come: self.pull.has_more(),
+            unwatched,
+            last: self.known_at.zip(self.frame_time),
+        }
+    }
+
+    /// Draws what is there, finished or not.
+    #[cfg(not(target_family = "wasm"))]
+    pub(crate) fn draw_now(&mut self, view: &View) {
+        self.draw(view, self.clock.now());
+    }
+
+    fn draw(&mut self, view: &View, now: Duration) {
+        self.drawn = self.renderer.render(view);
+        self.drawn_view = Some(*view);
+        self.pending.push_back(Submitted {
+            frame: self.drawn,
+            at: now,
+            size: view.size,
+        });
+        self.dirty = false;
     }
 
     fn take_events(&mut self, now: Duration) {
@@ -327,14 +360,11 @@ impl Session {
     fn take_report(&mut self, report: FrameReport, now: Duration) {
         while let Some(known) = self.pending.pop_front_if(|f| f.frame <= report.frame) {
             self.frame_time = Some(now.saturating_sub(known.at));
+            self.known_at = Some(now);
             self.frame_size = known.size;
         }
         self.pull.want(report.frame, &report.misses);
-        // Where the tables themselves were missing, or the bias moved, only the next frame can
-        // tell which bricks it needs.
-        let blind = !report.is_complete() && report.misses.is_empty();
-        let bias = self.report.as_ref().map_or(0.0, |r| r.memory_bias);
-        self.dirty |= blind || bias != report.memory_bias;
+        self.dirty |= report.redraw;
         self.report = Some(report);
     }
 
@@ -351,25 +381,26 @@ impl Session {
         delivery.cut
     }
 
-    fn status(&self, now: Duration, drew: bool, cut: bool) -> Status {
+    fn status(&self, now: Duration, drew: bool, cut: bool, draws_at: Option<Duration>) -> Status {
         let progress = self.pull.progress();
         let report = self.report.as_ref();
         let known = self.pending.is_empty() && !self.dirty;
         let idle = progress.wanted == 0 && !self.requests.is_sampling();
-        let due = [progress.retry_at, self.refresh.due()];
+        // While frames are being drawn, their end is awaited before the next.
+        let draws_at = draws_at.filter(|_| self.pending.is_empty());
+        let due = [progress.retry_at, self.refresh.due(), draws_at];
         let due = due
             .into_iter()
             .flatten()
             .min()
             .map(|at| at.saturating_sub(now));
         let poll = (!self.pending.is_empty()).then(|| poll_after(self.frame_time));
-        let again = if cut || (self.dirty && self.pending.is_empty()) {
-            Again::Now
-        } else {
-            due.into_iter()
-                .chain(poll)
-                .min()
-                .map_or(Again::WhenWoken, Again::After)
+        let next = due.into_iter().chain(poll).min();
+        let again = match next {
+            _ if cut => Again::Now,
+            Some(Duration::ZERO) => Again::Now,
+            Some(time) => Again::After(time),
+            None => Again::WhenWoken,
         };
         Status {
             frame: self.drawn,

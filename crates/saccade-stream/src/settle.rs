@@ -52,7 +52,7 @@ impl Session {
         let deadline = Instant::now() + timeout;
         let mut reports = Vec::new();
         loop {
-            let status = self.advance(view, std::mem::take(&mut reports));
+            let status = self.advance(view, std::mem::take(&mut reports), true);
             if status.lost {
                 return Err(SettleError::Lost);
             }
@@ -65,6 +65,7 @@ impl Session {
                 });
             }
             if Instant::now() >= deadline {
+                self.draw_now(view);
                 return Err(SettleError::Timeout {
                     waited: timeout,
                     status: Box::new(status),
