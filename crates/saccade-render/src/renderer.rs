@@ -111,7 +111,8 @@ pub enum Delivery {
     Resident,
     /// The next frame knows that nothing is there.
     Empty,
-    /// Everything in memory is in use. It will be asked for again if it is still wanted.
+    /// Everything in memory is in use. Draw on: the frames that follow become coarser until they
+    /// fit, and ask for the brick again if they still want it.
     NoRoom,
 }
 

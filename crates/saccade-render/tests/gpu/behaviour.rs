@@ -357,6 +357,55 @@ fn a_working_set_that_does_not_fit_becomes_coarser_and_settles() {
     );
 }
 
+/// As a client that draws only when there is a reason to.
+#[test]
+fn reasons_to_draw_lead_to_a_complete_picture() {
+    let Some(gpu) = gpu() else { return };
+    let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 0.01)], 100.0);
+    let extent = UVec3::new(500, 400, 300);
+    let volume = Arc::new(Volume::new("v", extent, DVec3::splat(4.0)).unwrap());
+    let voxels = vec![100; BRICK_STORED_VOXELS];
+    for memory_bytes in [4 << 20, 5 << 20, 256 << 20] {
+        let options = RendererOptions {
+            memory_bytes,
+            ..RendererOptions::default()
+        };
+        let mut renderer = Renderer::new(&gpu, volume.clone(), options).unwrap();
+        renderer.set_transfer_function(&transfer);
+        for zoom in [1.5, 0.02, 4.0] {
+            let camera = Camera::around(&volume).zoomed(zoom);
+            let view = View {
+                lod_bias: -2.0,
+                ..View::new(camera, SIZE)
+            };
+            let mut reason = true;
+            let mut last = None;
+            for _ in 0..100 {
+                if !std::mem::take(&mut reason) {
+                    break;
+                }
+                let report = frame(&mut renderer, &view);
+                reason |= report.redraw;
+                for &id in &report.misses {
+                    renderer.deliver(id, BrickVoxels::Voxels(&voxels)).unwrap();
+                    reason = true;
+                }
+                last = Some(report);
+            }
+            let last = last.unwrap();
+            assert!(
+                last.is_complete(),
+                "{memory_bytes} bytes, zoom {zoom}: {last:?}"
+            );
+            assert!(!reason, "there is always a reason");
+            assert_eq!(
+                last.memory_bias > 0.0,
+                memory_bytes < 10 << 20 && zoom > 1.0
+            );
+        }
+    }
+}
+
 #[test]
 fn huge_volumes_open_within_the_ceiling() {
     let Some(gpu) = gpu() else { return };
