@@ -68,11 +68,13 @@
 //! It fetches nothing, opens no window, starts no thread and reads no clock. One channel, 8 bit,
 //! one-dimensional transfer functions.
 
+mod delivery;
 mod frame;
 mod gpu;
 mod image;
 mod layout;
 mod memory;
+mod options;
 mod ray_caster;
 mod readback;
 mod renderer;
@@ -81,11 +83,11 @@ mod resources;
 mod stored_brick;
 mod view;
 
+pub use delivery::{BrickVoxels, Delivery, DeliveryError};
 pub use gpu::{Gpu, GpuError};
 pub use image::{Image, ReadError};
-pub use renderer::{
-    BrickVoxels, Delivery, DeliveryError, Renderer, RendererError, RendererOptions,
-};
+pub use options::{RendererError, RendererOptions};
+pub use renderer::Renderer;
 pub use report::{Fidelity, FrameReport, MemoryUse, Statistics};
 pub use view::View;
 /// The GPU interface, so that all rooms use one version.

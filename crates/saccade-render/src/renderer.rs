@@ -5,17 +5,19 @@ use std::sync::Arc;
 
 use glam::UVec2;
 use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
-use saccade_core::page_table::{PageTableError, PageTableShape, PageTables};
+use saccade_core::page_table::{PageTableShape, PageTables};
 use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
+use crate::delivery::{BrickVoxels, Delivery, DeliveryError};
 use crate::frame::{frame_uniform, transfer_storage};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
 use crate::memory::plan::{DeviceLimits, Misfit, Plan, READBACKS};
 use crate::memory::pressure::Pressure;
 use crate::memory::{Frame, Placement, VirtualMemory, Want};
+use crate::options::{RendererError, RendererOptions};
 use crate::readback::{self, Staging};
 use crate::report::{FrameReport, MemoryUse, RawReport};
 use crate::resources::{Picture, Resources};
@@ -28,115 +30,6 @@ const CHANNELS: u32 = 1;
 const STORAGE_BUFFERS: u64 = 6;
 /// Page table blocks made for one report; the others come with the next.
 const TABLES_PER_FRAME: u32 = 64;
-
-/// What a renderer may use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct RendererOptions {
-    /// Ceiling for bricks, tables and readbacks together \[bytes\]. Small volumes use less.
-    pub memory_bytes: u64,
-    /// How page tables are cut; `None` chooses by the volume's size.
-    pub page_table_shape: Option<PageTableShape>,
-    /// Submissions a frame is cut into. More than one keeps slow drivers from giving up on a
-    /// frame that takes seconds, and lets windows breathe between.
-    pub bands: u32,
-}
-
-impl Default for RendererOptions {
-    fn default() -> Self {
-        Self {
-            memory_bytes: 512 << 20,
-            page_table_shape: None,
-            bands: 1,
-        }
-    }
-}
-
-/// Why there is no renderer for a volume.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum RendererError {
-    /// A value type that is not drawn yet.
-    #[error("volumes of {dtype:?} voxels cannot be drawn; convert them to 8 bit")]
-    Dtype {
-        /// As the volume has it.
-        dtype: Dtype,
-    },
-    /// The volume does not fit the page tables.
-    #[error("the volume cannot be addressed")]
-    PageTable {
-        /// Which part does not fit.
-        #[from]
-        source: PageTableError,
-    },
-    /// A page table shape that the shaders cannot walk.
-    #[error("page tables cannot be cut as {shape:?}; use depth 2 or 3 and blocks of 16 or 32")]
-    PageTableShape {
-        /// As asked for.
-        shape: PageTableShape,
-    },
-    /// The ceiling leaves no room to work in.
-    #[error("{ceiling} bytes of GPU memory are too few for this volume; allow {needed} or more")]
-    Ceiling {
-        /// As asked for \[bytes\].
-        ceiling: u64,
-        /// What would do \[bytes\].
-        needed: u64,
-    },
-    /// The device does not offer what the shaders need.
-    #[error("the GPU offers {offered} {what}, and {needed} are needed")]
-    Limit {
-        /// Which limit.
-        what: &'static str,
-        /// What the device has.
-        offered: u64,
-        /// What is needed.
-        needed: u64,
-    },
-}
-
-/// What a delivered brick holds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BrickVoxels<'a> {
-    /// The voxels with their border, as measured, x fastest:
-    /// [`BRICK_STORED_VOXELS`](saccade_core::brick::BRICK_STORED_VOXELS) values.
-    Voxels(&'a [u8]),
-    /// Nothing was acquired there.
-    Empty,
-}
-
-/// What became of a delivered brick.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Delivery {
-    /// The next frame draws it.
-    Resident,
-    /// The next frame knows that nothing is there.
-    Empty,
-    /// Everything in memory is in use. Draw on: the frames that follow become coarser until they
-    /// fit, and ask for the brick again if they still want it.
-    NoRoom,
-}
-
-/// A brick that cannot be taken: the caller's mistake.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum DeliveryError {
-    /// The volume has no such brick.
-    #[error("the volume has no {id}")]
-    NoSuchBrick {
-        /// As given.
-        id: BrickId,
-    },
-    /// Too few or too many voxels.
-    #[error("{id} came with {got} voxels instead of {expected}")]
-    Length {
-        /// As given.
-        id: BrickId,
-        /// Voxels given.
-        got: usize,
-        /// Voxels of a brick with its border.
-        expected: usize,
-    },
-}
 
 /// Draws one volume. See the crate's documentation for the way of a frame.
 #[derive(Debug)]

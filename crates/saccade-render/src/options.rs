@@ -1,0 +1,69 @@
+//! What a renderer may use, and why there may be none.
+
+use saccade_core::page_table::{PageTableError, PageTableShape};
+use saccade_core::volume::Dtype;
+
+/// What a renderer may use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RendererOptions {
+    /// Ceiling for bricks, tables and readbacks together \[bytes\]. Small volumes use less.
+    pub memory_bytes: u64,
+    /// How page tables are cut; `None` chooses by the volume's size.
+    pub page_table_shape: Option<PageTableShape>,
+    /// Submissions a frame is cut into. More than one keeps slow drivers from giving up on a
+    /// frame that takes seconds, and lets windows breathe between.
+    pub bands: u32,
+}
+
+impl Default for RendererOptions {
+    fn default() -> Self {
+        Self {
+            memory_bytes: 512 << 20,
+            page_table_shape: None,
+            bands: 1,
+        }
+    }
+}
+
+/// Why there is no renderer for a volume.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RendererError {
+    /// A value type that is not drawn yet.
+    #[error("volumes of {dtype:?} voxels cannot be drawn; convert them to 8 bit")]
+    Dtype {
+        /// As the volume has it.
+        dtype: Dtype,
+    },
+    /// The volume does not fit the page tables.
+    #[error("the volume cannot be addressed")]
+    PageTable {
+        /// Which part does not fit.
+        #[from]
+        source: PageTableError,
+    },
+    /// A page table shape that the shaders cannot walk.
+    #[error("page tables cannot be cut as {shape:?}; use depth 2 or 3 and blocks of 16 or 32")]
+    PageTableShape {
+        /// As asked for.
+        shape: PageTableShape,
+    },
+    /// The ceiling leaves no room to work in.
+    #[error("{ceiling} bytes of GPU memory are too few for this volume; allow {needed} or more")]
+    Ceiling {
+        /// As asked for \[bytes\].
+        ceiling: u64,
+        /// What would do \[bytes\].
+        needed: u64,
+    },
+    /// The device does not offer what the shaders need.
+    #[error("the GPU offers {offered} {what}, and {needed} are needed")]
+    Limit {
+        /// Which limit.
+        what: &'static str,
+        /// What the device has.
+        offered: u64,
+        /// What is needed.
+        needed: u64,
+    },
+}
