@@ -7,6 +7,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
 
 mod behaviour;
+mod functions;
 mod harness;
 mod oracle;
 mod pictures;
