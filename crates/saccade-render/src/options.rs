@@ -6,7 +6,8 @@ use saccade_core::volume::Dtype;
 /// What a renderer may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RendererOptions {
-    /// Ceiling for bricks, tables and readbacks together \[bytes\]. Small volumes use less.
+    /// Ceiling for bricks, tables and readbacks together \[bytes\]. Small volumes use less. The
+    /// picture and some kilobytes of constants come on top; the host keeps a copy of the tables.
     pub memory_bytes: u64,
     /// How page tables are cut; `None` chooses by the volume's size.
     pub page_table_shape: Option<PageTableShape>,

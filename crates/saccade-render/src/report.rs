@@ -66,7 +66,7 @@ pub struct Statistics {
     pub blocks_used: u32,
 }
 
-/// Memory on the device \[bytes\]. All but the picture stays below the ceiling.
+/// Memory on the device \[bytes\]: [`Self::total`] stays below the ceiling.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MemoryUse {
     /// The brick cache.
