@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2, UVec3};
-use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
+use saccade_core::brick::{
+    BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS, BrickId,
+};
 use saccade_core::camera::Camera;
 use saccade_core::page_table::PageTableShape;
 use saccade_core::space::Point;
@@ -469,6 +471,77 @@ fn huge_volumes_open_within_the_ceiling() {
             .count();
         assert!(seen > 100, "{extent}: {seen} pixels show the box");
     }
+}
+
+/// What is seen depends on where the eye is within the matter, not on where that is in the volume.
+#[test]
+fn precision_is_the_same_everywhere_in_a_petascale_volume() {
+    let Some(gpu) = gpu() else { return };
+    let extent = UVec3::new(2_000_000, 2_000_000, 250_000);
+    let voxel_nm = DVec3::new(5.0, 5.0, 40.0);
+    let volume = Arc::new(Volume::new("v", extent, voxel_nm).unwrap());
+    let transfer = ramp(
+        Polarity::Bright,
+        ColorMap::Gray,
+        &[(0.3, 0.0), (0.8, 0.7)],
+        40.0,
+    );
+    let matter = DVec3::new(200.0, 200.0, 25.0);
+    // Whole bricks at every level that is close enough to be seen.
+    let places = [
+        DVec3::splat(1024.0),
+        DVec3::new(1_573_888.0, 1_836_032.0, 197_632.0),
+    ];
+    let pictures = places.map(|middle| {
+        let options = RendererOptions {
+            memory_bytes: 64 << 20,
+            ..RendererOptions::default()
+        };
+        let mut renderer = Renderer::new(&gpu, volume.clone(), options).unwrap();
+        renderer.set_transfer_function(&transfer);
+        let target = Point::new(middle * voxel_nm);
+        let camera = Camera {
+            target,
+            distance_nm: 250.0,
+            ..Camera::around(&volume)
+        };
+        let view = View {
+            background: [0.3; 3],
+            ..View::new(camera, SIZE)
+        };
+        for _ in 0..60 {
+            let report = frame(&mut renderer, &view);
+            if report.is_complete() {
+                return (read(&renderer), report.statistics.samples);
+            }
+            for &id in &report.misses {
+                let down = volume.levels[id.level() as usize].downsampling;
+                let low = (id.brick() * BRICK_EDGE).as_dvec3() - f64::from(BRICK_BORDER);
+                let cells = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE)).iter();
+                let voxels: Vec<u8> = cells
+                    .map(|cell| {
+                        let at = (low + cell.as_dvec3() + 0.5) * down - middle;
+                        let wave = (at.x / 9.0).sin() + (at.y / 7.0).cos() + (at.z / 2.0).sin();
+                        let inside = at.abs().cmplt(matter).all();
+                        if inside {
+                            (128.0 + 40.0 * wave) as u8
+                        } else {
+                            0
+                        }
+                    })
+                    .collect();
+                renderer.deliver(id, BrickVoxels::Voxels(&voxels)).unwrap();
+            }
+        }
+        panic!("not complete after 60 frames");
+    });
+    let [(near, samples), (far, _)] = &pictures;
+    assert!(*samples > 10_000);
+    crate::harness::keep("place-near", near);
+    crate::harness::keep("place-far", far);
+    let db = psnr(near, far);
+    // With positions in plain f32 they would be 60 dB apart.
+    assert!(db >= 80.0, "{db:.1} dB between the two places");
 }
 
 #[test]
