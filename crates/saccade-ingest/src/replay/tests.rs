@@ -268,7 +268,8 @@ fn shared(folder: &str) -> Option<PathBuf> {
     if path.is_dir() {
         return Some(path);
     }
-    eprintln!("skipped: {} is not there", path.display());
+    let text = format!("skipped: {} is not there\n", path.display());
+    io::Write::write_all(&mut io::stderr(), text.as_bytes()).unwrap();
     None
 }
 

@@ -10,12 +10,17 @@ mod files;
 mod pages;
 mod phantom;
 mod sections;
+mod zarr;
 
 pub use pages::TiffPages;
 pub use phantom::PhantomStack;
 pub use sections::SectionFolder;
+pub use zarr::{Window, ZarrStack};
 
 pub(crate) use files::volume_name;
+
+/// Whatever else can go wrong in a library.
+pub type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
 /// What a stack is.
 #[derive(Clone, Debug, PartialEq)]
@@ -106,6 +111,14 @@ pub enum StackError {
         /// File or folder.
         path: PathBuf,
     },
+    /// An OME-Zarr that cannot be read as a stack.
+    #[error("the OME-Zarr cannot be read as a stack: {}", path.display())]
+    Zarr {
+        /// Why.
+        source: BoxError,
+        /// The group or array.
+        path: PathBuf,
+    },
     /// More was asked for than there is.
     #[error("the stack has {extent} voxels; section {section} at {min} with {size} is not in it")]
     Outside {
@@ -120,7 +133,7 @@ pub enum StackError {
     },
 }
 
-/// Opens a stack: a folder of sections or a multi-page TIFF.
+/// Opens a stack: a folder of sections, a multi-page TIFF or an OME-Zarr of 8 bit.
 ///
 /// # Errors
 ///
@@ -131,6 +144,9 @@ pub fn open(path: &Path) -> Result<Box<dyn Stack>, StackError> {
         path: path.to_owned(),
     };
     let meta = std::fs::metadata(path).map_err(failed)?;
+    if is_zarr(path) {
+        return Ok(Box::new(ZarrStack::open(path, None)?));
+    }
     if meta.is_dir() {
         let sections = files::sections_of(path)?;
         return match &sections[..] {

@@ -193,3 +193,148 @@ fn what_is_wrong_is_said_with_the_file() {
     let pages = error(open(&folder.path().join("s0.tif")));
     assert!(matches!(pages, StackError::Image { .. }), "{pages:?}");
 }
+
+/// An OME-Zarr 0.4 written by hand: chunks of 5 x 6 x 7, uncompressed, one of them left out.
+fn zarr(folder: &Path, channels: bool, sixteen: bool) {
+    let (chunk, size) = ([5, 6, 7], [EXTENT.z, EXTENT.y, EXTENT.x]);
+    let axis = |name| format!(r#"{{"name":"{name}","type":"space","unit":"micrometer"}}"#);
+    let mut axes = ["z", "y", "x"].map(axis).to_vec();
+    let (mut shape, mut chunks, mut scale) =
+        (size.to_vec(), chunk.to_vec(), vec![0.04, 0.005, 0.004]);
+    if channels {
+        axes.insert(0, r#"{"name":"c","type":"channel"}"#.to_owned());
+        shape.insert(0, 2);
+        chunks.insert(0, 1);
+        scale.insert(0, 1.0);
+    }
+    let axes = axes.join(",");
+    let attributes = format!(
+        r#"{{"multiscales":[{{"version":"0.4","axes":[{axes}],"datasets":[{{"path":"0",
+            "coordinateTransformations":[{{"type":"scale","scale":{scale:?}}}]}}]}}]}}"#
+    );
+    let dtype = if sixteen { "<u2" } else { "|u1" };
+    let array = format!(
+        r#"{{"zarr_format":2,"shape":{shape:?},"chunks":{chunks:?},"dtype":"{dtype}","fill_value":0,
+            "order":"C","filters":null,"compressor":null,"dimension_separator":"/"}}"#
+    );
+    fs::create_dir_all(folder.join("0")).unwrap();
+    fs::write(folder.join(".zattrs"), attributes).unwrap();
+    fs::write(folder.join(".zgroup"), r#"{"zarr_format":2}"#).unwrap();
+    fs::write(folder.join("0/.zarray"), array).unwrap();
+    let values = values();
+    let count = |n: usize| size[n].div_ceil(chunk[n]);
+    for at in VoxelBox::of_size(UVec3::new(count(2), count(1), count(0))).iter() {
+        if at == UVec3::ONE {
+            continue;
+        }
+        let mut bytes = Vec::new();
+        for inside in VoxelBox::of_size(UVec3::new(chunk[2], chunk[1], chunk[0])).iter() {
+            let v = at * UVec3::new(chunk[2], chunk[1], chunk[0]) + inside;
+            let index = ((v.z * EXTENT.y + v.y) * EXTENT.x + v.x) as usize;
+            let value = if v.cmplt(EXTENT).all() {
+                values[index]
+            } else {
+                99
+            };
+            bytes.push(value);
+            if sixteen {
+                bytes.push(1);
+            }
+        }
+        let channel = if channels { "0/0/" } else { "0/" };
+        let path = folder.join(format!("{channel}{}/{}/{}", at.z, at.y, at.x));
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, bytes).unwrap();
+    }
+}
+
+/// The values, with 0 where [`zarr`] leaves out a chunk.
+fn zarr_values() -> Vec<u8> {
+    let mut values = values();
+    let missing = VoxelBox::new(UVec3::new(7, 6, 5), UVec3::new(14, 12, 10));
+    for (value, at) in values.iter_mut().zip(VoxelBox::of_size(EXTENT).iter()) {
+        if missing.contains(at) {
+            *value = 0;
+        }
+    }
+    values
+}
+
+#[test]
+fn ome_zarrs_are_stacks() {
+    for channels in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        zarr(folder.path(), channels, false);
+        conformance::check(&*open(folder.path()).unwrap(), EXTENT, &zarr_values());
+        let info = open(folder.path()).unwrap().info().clone();
+        let nm = info.voxel_nm.unwrap();
+        assert!(
+            (nm - DVec3::new(4.0, 5.0, 40.0)).abs().max_element() < 1e-9,
+            "{nm}"
+        );
+    }
+}
+
+#[test]
+fn sixteen_bit_zarrs_need_a_window() {
+    let folder = tempfile::tempdir().unwrap();
+    zarr(folder.path(), false, true);
+    let refused = error(open(folder.path()));
+    let depth = matches!(
+        &refused,
+        StackError::Image {
+            source: ImageError::Depth { bits: 16 },
+            ..
+        }
+    );
+    assert!(depth, "{refused}");
+    // Stored are 256 + value, and 0.
+    let window = Window {
+        low: 256,
+        high: 256 + 254,
+    };
+    let stack = ZarrStack::open(folder.path(), Some(window)).unwrap();
+    let raised: Vec<u8> = zarr_values().iter().map(|v| v.saturating_add(1)).collect();
+    conformance::check(&stack, EXTENT, &raised);
+    assert_eq!(
+        [0, 256, 510, u16::MAX].map(|v| window.apply(v)),
+        [1, 1, 255, 255]
+    );
+
+    fs::write(folder.path().join(".zattrs"), "{}").unwrap();
+    assert!(matches!(
+        error(open(folder.path())),
+        StackError::Zarr { .. }
+    ));
+}
+
+#[test]
+fn zarrs_of_other_writers_are_stacks() {
+    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
+    let shared = std::env::var_os("SACCADE_SHARED")
+        .map_or(beside, PathBuf::from)
+        .join("data");
+    let source = shared.join("fib25-medulla/training_sample2/grayscale_maps");
+    if !source.is_dir() {
+        let text = format!("skipped: {} is not there\n", source.display());
+        std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes()).unwrap();
+        return;
+    }
+    // Both hold the same part of the same stack.
+    let source = SectionFolder::open(&source).unwrap();
+    let extent = UVec3::new(140, 135, 130);
+    let mut values = Vec::new();
+    for section in 60..190 {
+        values.extend(
+            source
+                .region(section, UVec2::new(40, 50), extent.truncate())
+                .unwrap()
+                .voxels,
+        );
+    }
+    for name in ["omezarr04_zyx_u8", "omezarr05_zyx_u8_sharded"] {
+        let stack = open(&shared.join("derived-refwriters/dev").join(name)).unwrap();
+        conformance::check(&*stack, extent, &values);
+        assert_eq!(stack.info().voxel_nm, Some(DVec3::splat(10.0)));
+    }
+}
