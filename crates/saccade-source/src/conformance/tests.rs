@@ -1,5 +1,7 @@
 //! Negative controls: each wrong source breaks the rule it should break.
 
+#![allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
+
 use std::sync::Arc;
 
 use bytes::Bytes;

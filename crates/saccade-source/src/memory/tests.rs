@@ -1,3 +1,5 @@
+#![allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
+
 use futures::{FutureExt, StreamExt};
 use glam::{DVec3, UVec3};
 use pollster::block_on;

@@ -1,3 +1,5 @@
+#![allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
+
 mod server;
 
 use std::sync::Arc;

@@ -63,7 +63,6 @@ impl IndexedTile {
         // In 0..=64 for every size that is not absurd.
         #[expect(
             clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
             reason = "clamped to small whole numbers; not-a-number becomes 0"
         )]
         let level = level.clamp(0.0, 64.0) as u32;
@@ -182,6 +181,7 @@ impl SectionIndex {
 }
 
 #[cfg(test)]
+#[allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
 mod tests {
     use super::*;
     use proptest::prelude::*;

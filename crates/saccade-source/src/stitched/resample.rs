@@ -71,7 +71,6 @@ impl Patch {
     /// samples must lie in the level and in sub-tiles the patch was made of, or in blank ones.
     #[expect(
         clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
         reason = "fixed point: positions in a patch are small and not negative, weights below 2^11"
     )]
     pub(super) fn sample(&self, pixel: DVec2, along: DVec2, out: &mut [u8]) {
@@ -142,6 +141,7 @@ pub(super) fn averaged(values: &[u8], size: UVec2, by: u32) -> Vec<u8> {
 }
 
 #[cfg(test)]
+#[allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
 mod tests {
     use super::*;
 

@@ -1,3 +1,5 @@
+#![allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
+
 mod changes;
 mod failures;
 mod fixture;
