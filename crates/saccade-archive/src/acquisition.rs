@@ -182,6 +182,41 @@ pub fn image_path(folder: &Path, file: &str) -> Option<PathBuf> {
 mod tests {
     use super::*;
 
+    /// A real acquisition: three sections of fourteen tiles, with stage positions and a solution.
+    #[test]
+    #[expect(clippy::print_stderr, reason = "a skipped test says so")]
+    fn a_real_list_and_its_solution_meet() {
+        let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared");
+        let shared = std::env::var_os("SACCADE_SHARED").map_or(beside, PathBuf::from);
+        let data = shared.join("data/at-tutorial-tiles");
+        if !data.is_dir() {
+            eprintln!("skipped: no {}; set SACCADE_SHARED", data.display());
+            return;
+        }
+        let list = tile_list::read(&data.join("DEMO_post_mongo/rick0.txt")).unwrap();
+        let patches = trakem2::read(&data.join("temp0_final/stack/Affine.xml")).unwrap();
+        assert_eq!((list.len(), patches.len()), (42, 42));
+        let images = tile_list::Images::below(&data.join("StarterMaterials/TIF")).unwrap();
+        for tile in &list {
+            let image = images.find(&tile.file).unwrap();
+            assert!(
+                image.ends_with(format!("{}.tif", tile.name())),
+                "{}",
+                image.display()
+            );
+            let patch = patches.iter().find(|p| p.name() == tile.name()).unwrap();
+            assert_eq!(
+                (patch.section, patch.size),
+                (tile.section, glam::UVec2::new(1376, 1040))
+            );
+            // The solution moves tiles of neighbouring columns by hundreds of pixels at most.
+            let (min, _) = patch.transform.bounds(patch.size.as_dvec2());
+            let moved = (min.0 - tile.corner).length();
+            assert!(moved < 800.0, "{} moved by {moved}", tile.name());
+        }
+        assert_eq!(list[0].corner, glam::DVec2::new(0.0, 5142.0));
+    }
+
     #[test]
     fn info_survives_its_file_and_more_fields() {
         let folder = tempfile::tempdir().unwrap();

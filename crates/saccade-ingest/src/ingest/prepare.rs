@@ -2,7 +2,7 @@
 //! becomes an outcome.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -273,11 +273,6 @@ fn with_sources(error: &(dyn std::error::Error + 'static)) -> String {
         .map(ToString::to_string)
         .collect::<Vec<_>>()
         .join(": ")
-}
-
-/// Where a record's image should be, if the record is sound.
-pub(super) fn path_of(folder: &Path, record: &TileRecord) -> Option<PathBuf> {
-    image_path(folder, &record.file)
 }
 
 #[cfg(test)]

@@ -248,7 +248,8 @@ impl Ingest<'_> {
         let before = SystemTime::now().checked_sub(self.options.keep_retired);
         let before = before.unwrap_or(SystemTime::UNIX_EPOCH);
         let volume = self.context.volume;
-        let retired = catalog.retired(volume, before, DELETE_AT_ONCE).await?;
+        let list = || catalog.retired(volume, before, DELETE_AT_ONCE);
+        let retired = retry(self.options, self.context.progress, list).await?;
         let mut deleted = Vec::new();
         for old in retired {
             match self.archive.storage().delete(&old.pyramid).await {
@@ -260,14 +261,14 @@ impl Ingest<'_> {
         if deleted.is_empty() {
             return Ok(());
         }
-        let catalog_error = retry(self.options, self.context.progress, async || {
+        retry(self.options, self.context.progress, async || {
             let mut commit = catalog.begin(volume).await?;
             for pyramid in &deleted {
                 commit.forget_retired(pyramid).await?;
             }
             commit.finish().await
-        });
-        catalog_error.await?;
+        })
+        .await?;
         Ok(())
     }
 

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use saccade_archive::acquisition::image_path;
 use saccade_archive::catalog::Waiting;
 
-use super::prepare::{Look, Outcome, WaitKind, look, path_of, quarantine};
+use super::prepare::{Look, Outcome, WaitKind, look, quarantine};
 
 /// Longest pause between two looks at a file \[polls\].
 const LONGEST_PAUSE: u64 = 16;
@@ -98,7 +99,7 @@ impl WaitingRoom {
             if due.len() == max {
                 break;
             }
-            let now = path_of(folder, &guest.waiting.record).and_then(|path| look(&path));
+            let now = image_path(folder, &guest.waiting.record.file).and_then(|path| look(&path));
             if guest.look != Some(now) {
                 // Not again before this attempt is over, which readmits it or lets it leave.
                 guest.next = u64::MAX;
