@@ -1,6 +1,6 @@
 // The application against a live simulated stream.
 import assert from 'node:assert/strict';
-import { access, appendFile, writeFile } from 'node:fs/promises';
+import { access, appendFile, readFile, writeFile } from 'node:fs/promises';
 import { join } from 'node:path';
 import { after, before, test } from 'node:test';
 
@@ -17,10 +17,10 @@ const TRANSFER = JSON.stringify({
   color_map: 'gray',
   window: [0.1, 0.8],
   opacity: [{ value: 0.15, opacity: 0.9 }, { value: 0.7, opacity: 0.02 }],
-  opacity_length_nm: 100,
+  opacity_length_nm: 40,
 });
-/** Two drivers round differently; another camera is below 30 dB. */
-const AGREE_DB = 40;
+/** Two software drivers agree to 62 dB; a camera 8 degrees off to 23 dB. */
+const AGREE_DB = 45;
 
 let work, browser, processes, url, page, complaints;
 
@@ -29,16 +29,17 @@ before(async () => {
   processes = [];
   const acquisition = join(work.path, 'acquisition');
   const archive = join(work.path, 'archive');
-  // Slow enough for the page to open while tiles arrive.
   processes.push(start('simulate', acquisition, '--phantom', '--extent', '256,256,32', '--voxel-nm', '8,8,40',
-    '--tile', '160x160', '--rate', '0.3', '--seed', '7'));
+    '--tile', '160x160', '--rate', '0.5', '--corrections', 'never', '--seed', '7'));
   await exists(join(acquisition, 'volume.json'));
   processes.push(start('ingest', acquisition, archive));
   await exists(join(archive, 'catalog.sqlite'));
   const serve = start('serve', archive, '--port', '0');
   processes.push(serve);
   [url] = await serve.printed(/http:\/\/[\w.:]+/);
-  await until('the volume is offered', async () => (await served()).length === 1, 30);
+  await until('tiles arrive', async () => (await served())[0]?.revision > 8, 60);
+  // The microscope pauses, so that the page opens on part of the volume however slow the machine.
+  processes[0].child.kill('SIGSTOP');
   browser = await launch();
   ({ page, complaints } = await open(browser, SIZE));
   await reportShaders(page);
@@ -55,31 +56,34 @@ test('the live volume reaches completeness, and agrees with saccade render', asy
   address.search = new URLSearchParams({ ui: 'off', camera: CAMERA, transfer: TRANSFER });
   await page.goto(address.href);
   await page.evaluate(() => { window.notReloaded = true; });
-  await until('the stream ends', async () => processes[0].child.exitCode === 0, 120);
+  await settled();
+  const part = await shot();
+  processes[0].child.kill('SIGCONT');
+  await processes[0].success();
   await settled();
 
   const shown = await shot();
+  const growth = psnr(part, shown);
+  assert.ok(growth < AGREE_DB - 15, `the volume did not grow: ${growth} dB`);
   assert.ok(covered(shown) > 0.2, `the volume covers ${covered(shown)} of the picture`);
   const agreement = psnr(shown, await rendered(CAMERA));
   assert.ok(agreement >= AGREE_DB, `the pictures agree to ${agreement} dB only`);
   const control = psnr(shown, await rendered(OTHER_CAMERA));
-  assert.ok(control < AGREE_DB - 10, `another camera's picture agrees as well: ${control} dB`);
-  console.log(`agreement ${agreement.toFixed(1)} dB, another camera ${control.toFixed(1)} dB`);
+  assert.ok(control < AGREE_DB - 15, `another camera's picture agrees as well: ${control} dB`);
+  console.log(`grown by ${growth.toFixed(1)} dB, agreement ${agreement.toFixed(1)} dB, another camera ${control.toFixed(1)} dB`);
 });
 
 test('a tile ingested afterwards changes the picture without a reload', async () => {
   const before = await shot();
   const acquisition = join(work.path, 'acquisition');
-  await writeFile(join(acquisition, 'tiles', 'late.png'), grayPng(256, 256, (x, y) => ((x >> 5) + (y >> 5)) % 2 ? 40 : 220));
+  await writeFile(join(acquisition, 'tiles', 'late.png'), grayPng(256, 256, (x, y) => ((x >> 6) + (y >> 6)) % 2 ? 20 : 235));
   const record = { record: 'tile', tile: 'late', file: 'tiles/late.png', section: 0, size: [256, 256], transform: [1, 0, 0, 1, 0, 0] };
-  const { revision } = await status();
   await appendFile(join(acquisition, 'tiles.jsonl'), JSON.stringify(record) + '\n');
-  await until('the page hears of the tile', async () => (await status()).revision > revision, 60);
   await settled();
 
   const shown = await shot();
   const change = psnr(before, shown);
-  assert.ok(change < AGREE_DB - 10, `the picture did not change: ${change} dB`);
+  assert.ok(change < AGREE_DB - 15, `the picture did not change: ${change} dB`);
   const agreement = psnr(shown, await rendered(CAMERA));
   assert.ok(agreement >= AGREE_DB, `the pictures agree to ${agreement} dB only`);
   assert.equal(await page.evaluate(() => window.notReloaded), true);
@@ -103,12 +107,14 @@ const status = () => page.evaluate(() => JSON.parse(JSON.stringify(window.saccad
 
 const served = async () => (await (await fetch(new URL('/volumes.json', url))).json()).volumes;
 
-/** Waits until the page shows the server's newest revision completely. */
+/** Waits until every record is taken in (each is one revision), and the page shows it completely. */
 async function settled() {
+  const records = (await readFile(join(work.path, 'acquisition', 'tiles.jsonl'), 'utf8')).trim().split('\n').length;
   await until('the picture is complete', async () => {
     const [{ revision }] = await served();
     const shown = await status();
-    return shown?.fidelity === 'complete' && shown.revision >= revision ? true : { revision, shown };
+    const done = revision >= records && shown?.fidelity === 'complete' && shown.revision >= revision;
+    return done || { records, revision, shown };
   }, 180);
 }
 
