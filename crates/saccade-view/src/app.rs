@@ -18,7 +18,7 @@ use crate::navigate::{Input, moved};
 use crate::options::ViewOptions;
 use crate::panel::{self, Settings};
 use crate::picture::{Picture, Place};
-use crate::quality::Quality;
+use crate::quality::{Events, Quality};
 use crate::setup::gpu_of;
 use crate::transfer_editor::TransferEditor;
 
@@ -38,6 +38,8 @@ pub(crate) struct App {
     acquisition: Acquisition,
     status: Option<Status>,
     preview: bool,
+    /// Whether the volume changed since the size of the picture was chosen.
+    changed: bool,
     start: Instant,
     /// What scripts are told after each frame, as JSON.
     publish: Box<dyn Fn(String)>,
@@ -109,10 +111,11 @@ impl App {
             editor: TransferEditor::default(),
             panel_open: true,
             picture: Picture::default(),
-            quality: Quality::default(),
+            quality: Quality::new(software),
             acquisition: Acquisition::new(surroundings.acquisition),
             status: None,
             preview: false,
+            changed: false,
             start: start(),
             publish: surroundings.publish,
             lost: surroundings.lost,
@@ -123,8 +126,7 @@ impl App {
     fn panels(&mut self, ui: &mut Ui) {
         Panel::bottom("fidelity").show(ui, |ui| {
             ui.horizontal(|ui| {
-                let arrow = if self.panel_open { "⏵" } else { "⏴" };
-                let side = ui.button(arrow).on_hover_text("Show or hide the panel");
+                let side = ui.selectable_label(self.panel_open, "Settings");
                 self.panel_open ^= side.clicked();
                 if let Some(status) = &self.status {
                     let acquisition = self.acquisition.status();
@@ -167,8 +169,15 @@ impl App {
         }
 
         let now = self.start.elapsed();
+        let events = Events {
+            moving,
+            changed: std::mem::take(&mut self.changed),
+            settled: self.status.as_ref().is_some_and(|status| status.settled),
+            full: self.full_frame_time(place),
+        };
+        // A picture alone is always as it should be.
         let scale = if self.ui {
-            self.quality.scale(now, moving, self.full_frame_time(place))
+            self.quality.scale(now, events)
         } else {
             1.0
         };
@@ -188,6 +197,11 @@ impl App {
         if status.lost && !self.status.as_ref().is_some_and(|before| before.lost) {
             (self.lost)();
         }
+        let revision = self
+            .status
+            .as_ref()
+            .map_or(status.revision, |before| before.revision);
+        self.changed |= status.revision != revision;
         self.status = Some(status);
     }
 

@@ -107,7 +107,7 @@ pub(crate) fn line(facts: &Facts<'_>) -> Vec<Piece> {
         line.push(full);
     }
     if facts.preview {
-        line.push(piece(Tone::Busy, "preview while moving".to_owned()));
+        line.push(piece(Tone::Busy, "preview".to_owned()));
     }
     match fidelity.level {
         Some(level) => line.push(piece(Tone::Plain, format!("level {level}"))),
@@ -311,7 +311,7 @@ mod tests {
         assert_eq!(
             text(&status, true, None),
             "3 bricks missing · substituted by up to 2 levels · 1 brick out of date · \
-             coarser by 1.2 levels: GPU memory is full · preview while moving · level 2 · 12 ms · \
+             coarser by 1.2 levels: GPU memory is full · preview · level 2 · 12 ms · \
              revision 14"
         );
     }

@@ -1,56 +1,113 @@
-//! Smaller pictures while the hand moves, where full ones would take too long.
+//! Smaller pictures where full ones would take too long: while the hand moves, and until the data
+//! of a first look are there.
 
 use std::time::Duration;
 
 /// A picture that takes longer than this feels stuck to the hand.
-const TARGET: Duration = Duration::from_millis(60);
+const MOVING: Duration = Duration::from_millis(60);
+/// While data arrive, a picture that takes longer keeps the user interface waiting too long.
+const ARRIVING: Duration = Duration::from_millis(400);
 /// Growing back needs this much room, so that the size does not flicker.
 const ROOM: f64 = 0.7;
 /// After so long without a movement the picture is refined.
 const STILL: Duration = Duration::from_millis(200);
 /// Sizes a picture may have, as parts of the full one along each axis.
-const SCALES: [f64; 6] = [1.0, 0.75, 0.5, 0.35, 0.25, 0.18];
+const SCALES: [f64; 7] = [1.0, 0.75, 0.5, 0.35, 0.25, 0.18, 0.125];
+/// Where to begin on a device that draws on the CPU.
+const CAUTIOUS: usize = 4;
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Phase {
+    /// The hand moved, last at this time.
+    Moving(Duration),
+    /// Still, but the picture of this size is not finished.
+    Arriving,
+    /// Full size, until something moves or changes.
+    Full,
+}
+
+/// What happened since the last picture.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Events {
+    /// The hand moved the view.
+    pub(crate) moving: bool,
+    /// The volume changed.
+    pub(crate) changed: bool,
+    /// The last picture shows all it can, at the size it has.
+    pub(crate) settled: bool,
+    /// Time that a picture of full size takes, as far as known.
+    pub(crate) full: Option<Duration>,
+}
 
 /// Chooses the size of pictures.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 pub(crate) struct Quality {
+    phase: Phase,
     step: usize,
-    moved: Option<Duration>,
+    /// Step of the last picture.
+    last: Option<usize>,
 }
 
 impl Quality {
+    /// For a device that draws on the CPU, or a real one.
+    pub(crate) fn new(software: bool) -> Self {
+        let step = if software { CAUTIOUS } else { 0 };
+        Self {
+            phase: Phase::Arriving,
+            step,
+            last: None,
+        }
+    }
+
     /// Part of the full size that the next picture should have.
-    ///
-    /// `full` is the time that a picture of full size takes, as far as known.
-    pub(crate) fn scale(&mut self, now: Duration, moving: bool, full: Option<Duration>) -> f64 {
-        if moving {
-            self.moved = Some(now);
+    pub(crate) fn scale(&mut self, now: Duration, events: Events) -> f64 {
+        self.phase = match self.phase {
+            _ if events.moving => Phase::Moving(now),
+            Phase::Moving(last) if now < last + STILL => Phase::Moving(last),
+            Phase::Moving(_) => Phase::Arriving,
+            Phase::Full if events.changed => Phase::Arriving,
+            other => other,
+        };
+        let step = match self.phase {
+            Phase::Moving(_) => self.fit(events.full, MOVING),
+            Phase::Arriving => self.fit(events.full, ARRIVING),
+            Phase::Full => 0,
+        };
+        // A finished preview is followed by the full picture.
+        let finished = events.settled && self.last == Some(step);
+        let step = if self.phase == Phase::Arriving && finished {
+            0
+        } else {
+            step
+        };
+        if self.phase == Phase::Arriving && step == 0 {
+            self.phase = Phase::Full;
         }
-        if self.is_still(now) {
-            return 1.0;
-        }
+        self.last = Some(step);
+        SCALES[step]
+    }
+
+    /// The largest size whose picture takes no longer than `target`.
+    fn fit(&mut self, full: Option<Duration>, target: Duration) -> usize {
         if let Some(full) = full {
-            let full = full.as_secs_f64();
-            let fits = |scale: f64, room: f64| full * scale * scale <= room * TARGET.as_secs_f64();
-            let last = SCALES.len() - 1;
-            while self.step < last && !fits(SCALES[self.step], 1.0) {
+            let (full, target) = (full.as_secs_f64(), target.as_secs_f64());
+            let fits = |step: usize, room: f64| full * SCALES[step].powi(2) <= room * target;
+            while self.step + 1 < SCALES.len() && !fits(self.step, 1.0) {
                 self.step += 1;
             }
-            while self.step > 0 && fits(SCALES[self.step - 1], ROOM) {
+            while self.step > 0 && fits(self.step - 1, ROOM) {
                 self.step -= 1;
             }
         }
-        SCALES[self.step]
+        self.step
     }
 
-    /// Time until the picture is to be refined, if it is to be.
+    /// Time until the hand counts as still, if the picture is to be refined then.
     pub(crate) fn refines_in(&self, now: Duration) -> Option<Duration> {
-        let until = self.moved? + STILL;
-        (until > now && self.step > 0).then(|| until - now)
-    }
-
-    fn is_still(&self, now: Duration) -> bool {
-        self.moved.is_none_or(|moved| now >= moved + STILL)
+        match self.phase {
+            Phase::Moving(last) if self.step > 0 => Some((last + STILL).saturating_sub(now)),
+            _ => None,
+        }
     }
 }
 
@@ -62,11 +119,26 @@ mod tests {
         Duration::from_millis(ms)
     }
 
+    fn events(full: u64) -> Events {
+        Events {
+            full: Some(ms(full)),
+            ..Events::default()
+        }
+    }
+
+    fn moving(full: u64) -> Events {
+        Events {
+            moving: true,
+            ..events(full)
+        }
+    }
+
     #[test]
     fn a_fast_gpu_never_shrinks_the_picture() {
-        let mut quality = Quality::default();
+        let mut quality = Quality::new(false);
+        assert_eq!(quality.scale(ms(0), Events::default()), 1.0);
         for now in (0..2_000).step_by(16) {
-            assert_eq!(quality.scale(ms(now), true, Some(ms(20))), 1.0);
+            assert_eq!(quality.scale(ms(now), moving(20)), 1.0);
         }
         assert_eq!(
             quality.refines_in(ms(2_000)),
@@ -76,41 +148,81 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_one_does_while_the_hand_moves_and_refines_after() {
-        let mut quality = Quality::default();
-        assert_eq!(
-            quality.scale(ms(0), false, Some(ms(900))),
-            1.0,
-            "nobody moved yet"
-        );
-        assert_eq!(quality.scale(ms(10), true, Some(ms(900))), 0.25);
-        assert_eq!(
-            quality.scale(ms(100), false, Some(ms(900))),
-            0.25,
-            "a short pause"
-        );
+    fn a_slow_one_does_while_the_hand_moves_and_refines_when_the_preview_is_finished() {
+        let mut quality = Quality::new(false);
+        quality.scale(ms(0), Events::default());
+        assert_eq!(quality.scale(ms(5), events(900)), 1.0, "nobody moved yet");
+        assert_eq!(quality.scale(ms(10), moving(900)), 0.25);
+        assert_eq!(quality.scale(ms(100), events(900)), 0.25, "a short pause");
         assert_eq!(quality.refines_in(ms(100)), Some(ms(110)));
-        assert_eq!(quality.scale(ms(210), false, Some(ms(900))), 1.0);
-        assert_eq!(quality.refines_in(ms(210)), None);
+        assert_eq!(
+            quality.scale(ms(210), events(900)),
+            0.5,
+            "still: a better preview"
+        );
+        let settled = Events {
+            settled: true,
+            ..events(900)
+        };
+        assert_eq!(quality.scale(ms(300), settled), 1.0);
+        assert_eq!(
+            quality.scale(ms(400), events(900)),
+            1.0,
+            "finer data do not shrink it again"
+        );
+        assert_eq!(quality.refines_in(ms(400)), None);
+    }
+
+    #[test]
+    fn a_preview_of_another_size_is_not_this_one_finished() {
+        let mut quality = Quality::new(false);
+        quality.scale(ms(0), moving(900));
+        // Settled is what the picture of the moving size was.
+        let settled = Events {
+            settled: true,
+            ..events(900)
+        };
+        assert_eq!(quality.scale(ms(300), settled), 0.5);
+        assert_eq!(quality.scale(ms(310), settled), 1.0);
+    }
+
+    #[test]
+    fn changes_bring_the_preview_back_on_slow_devices_only() {
+        for (full, scale) in [(900, 0.5), (100, 1.0)] {
+            let mut quality = Quality::new(false);
+            quality.scale(ms(0), Events::default());
+            assert_eq!(quality.scale(ms(10), events(full)), 1.0);
+            let changed = Events {
+                changed: true,
+                ..events(full)
+            };
+            assert_eq!(quality.scale(ms(20), changed), scale, "{full} ms");
+        }
+    }
+
+    #[test]
+    fn a_software_device_begins_small() {
+        let mut quality = Quality::new(true);
+        assert_eq!(quality.scale(ms(0), Events::default()), 0.25);
+        assert_eq!(
+            quality.scale(ms(10), events(30)),
+            1.0,
+            "it is fast enough after all"
+        );
     }
 
     #[test]
     fn sizes_do_not_flicker_around_a_boundary() {
-        let mut quality = Quality::default();
+        let mut quality = Quality::new(false);
         let mut changes = 0;
-        let mut last = quality.scale(ms(0), true, Some(ms(100)));
+        let mut last = quality.scale(ms(0), moving(100));
         for n in 0..100 {
-            // At three quarters a full picture of 100 ms just fits.
-            let full = if n % 2 == 0 { ms(104) } else { ms(96) };
-            let scale = quality.scale(ms(n), true, Some(full));
+            // At three quarters a picture of 107 ms just fits.
+            let full = if n % 2 == 0 { 104 } else { 96 };
+            let scale = quality.scale(ms(n), moving(full));
             changes += u32::from(scale != last);
             last = scale;
         }
         assert!(changes <= 1, "{changes} changes of size");
-    }
-
-    #[test]
-    fn nothing_known_changes_nothing() {
-        assert_eq!(Quality::default().scale(ms(0), true, None), 1.0);
     }
 }

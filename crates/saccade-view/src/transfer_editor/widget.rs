@@ -91,7 +91,7 @@ fn paint(
 
     let bar = plot.width() / 256.0;
     let faint = visuals.weak_text_color().gamma_multiply(0.5);
-    for (value, height) in (0_u8..).zip(bars(histogram.counts())) {
+    for (value, height) in (0..=u8::MAX).zip(bars(histogram.counts())) {
         if height > 0.0 {
             let top = screen_from_plot(plot, f32::from(value) / 256.0, height);
             let rect = Rect::from_min_max(top, pos2(top.x + bar, plot.max.y));
@@ -148,4 +148,114 @@ fn ramp(rect: Rect, transfer: &TransferFunction) -> Shape {
         }
     }
     Shape::mesh(mesh)
+}
+
+#[cfg(test)]
+mod tests {
+    use egui::{Context, Event, Modifiers, PointerButton, RawInput};
+    use saccade_core::transfer::OpacityPoint;
+
+    use super::*;
+
+    /// A hand on the plot of a window 400 points wide, without a screen.
+    struct Hand {
+        context: Context,
+        editor: TransferEditor,
+        transfer: TransferFunction,
+        time: f64,
+        changes: u32,
+    }
+
+    impl Hand {
+        fn new() -> Self {
+            let plain = Histogram::default().transfer_function(glam::DVec3::ONE);
+            let corner = |value, opacity| OpacityPoint { value, opacity };
+            let transfer = TransferFunction {
+                opacity: vec![corner(0.25, 0.5), corner(0.75, 0.5)],
+                ..plain
+            };
+            let context = Context::default();
+            let mut hand = Self {
+                context,
+                editor: TransferEditor::default(),
+                transfer,
+                time: 0.0,
+                changes: 0,
+            };
+            hand.frame(Vec::new());
+            hand
+        }
+
+        fn frame(&mut self, events: Vec<Event>) {
+            self.time += 0.02;
+            let screen = Rect::from_min_size(Pos2::ZERO, vec2(400.0, 300.0));
+            let input = RawInput {
+                screen_rect: Some(screen),
+                time: Some(self.time),
+                events,
+                ..RawInput::default()
+            };
+            let histogram = Histogram::default();
+            let context = self.context.clone();
+            drop(context.run_ui(input, |ui| {
+                let changed = show(ui, &mut self.editor, &mut self.transfer, &histogram);
+                self.changes += u32::from(changed);
+            }));
+        }
+
+        fn move_to(&mut self, value: f32, opacity: f32) -> Pos2 {
+            let plot = Rect::from_min_size(Pos2::ZERO, vec2(400.0, HEIGHT));
+            let at = screen_from_plot(plot, value, opacity);
+            self.frame(vec![Event::PointerMoved(at)]);
+            at
+        }
+
+        fn button(&mut self, pos: Pos2, button: PointerButton, pressed: bool) {
+            let modifiers = Modifiers::NONE;
+            self.frame(vec![Event::PointerButton {
+                pos,
+                button,
+                pressed,
+                modifiers,
+            }]);
+        }
+
+        fn click(&mut self, value: f32, opacity: f32, button: PointerButton) {
+            let at = self.move_to(value, opacity);
+            self.button(at, button, true);
+            self.button(at, button, false);
+        }
+    }
+
+    #[test]
+    fn a_corner_is_dragged() {
+        let mut hand = Hand::new();
+        let at = hand.move_to(0.25, 0.5);
+        hand.button(at, PointerButton::Primary, true);
+        hand.move_to(0.35, 0.6);
+        let to = hand.move_to(0.5, 0.9);
+        hand.button(to, PointerButton::Primary, false);
+        let moved = hand.transfer.opacity[0];
+        assert!(
+            (moved.value - 0.5).abs() < 0.01 && (moved.opacity - 0.9).abs() < 0.01,
+            "{moved:?}"
+        );
+        let changes = hand.changes;
+        hand.move_to(0.1, 0.1);
+        assert_eq!(hand.changes, changes, "let go is let go");
+    }
+
+    #[test]
+    fn two_clicks_add_a_corner_and_the_other_button_removes_one() {
+        let mut hand = Hand::new();
+        hand.click(0.5, 0.2, PointerButton::Primary);
+        assert_eq!(hand.changes, 0, "one click does nothing");
+        hand.click(0.5, 0.2, PointerButton::Primary);
+        assert_eq!(hand.transfer.opacity.len(), 3);
+        assert!((hand.transfer.opacity[1].opacity - 0.2).abs() < 0.01);
+        hand.click(0.75, 0.5, PointerButton::Secondary);
+        assert_eq!(hand.transfer.opacity.len(), 2);
+        assert_eq!(hand.transfer.opacity[0].value, 0.25);
+        assert_eq!(hand.changes, 2);
+    }
 }
