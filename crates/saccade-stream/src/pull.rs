@@ -434,10 +434,6 @@ impl Pull {
     /// Memory that chunks take \[bytes\]. One that is both being loaded and kept counts twice, though
     /// it is there once.
     pub fn host_bytes(&self) -> u64 {
-        #[expect(
-            clippy::iter_over_hash_type,
-            reason = "the order of a sum does not show"
-        )]
         let window = self.window.values().map(bytes_of).sum::<u64>();
         window + self.cache.bytes()
     }

@@ -24,7 +24,7 @@ pub(crate) enum Event {
     Change(Change),
     Sample {
         number: u64,
-        sample: Sample,
+        sample: Box<Sample>,
     },
 }
 
@@ -110,7 +110,7 @@ impl Requests {
         self.samples += 1;
         let number = self.samples;
         let handle = spawn_abortable(async move {
-            let sample = sample(&*source, retry).await;
+            let sample = Box::new(sample(&*source, retry).await);
             drop(to.send(Event::Sample { number, sample }));
             wake();
         });

@@ -127,7 +127,7 @@ impl World {
         let whole = VoxelBox::of_size(EXTENT);
         let array: Vec<u8> = whole
             .iter()
-            .map(|at| (at.x * 3 + at.y * 5 + at.z * 7) as u8 | 1)
+            .map(|at| u8::try_from((at.x * 3 + at.y * 5 + at.z * 7) % 256).unwrap() | 1)
             .collect();
         let source = ArraySource::new(volume, array.clone()).unwrap();
         let retry = crate::policy::Retry {
