@@ -1,5 +1,7 @@
 //! Ingest as a whole: what arrives, what is refused, what fails, what is killed.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
 mod faults;
 mod kill;
 mod quarantine;
