@@ -1,7 +1,5 @@
 //! What the catalog promises: order, revisions, boxes, all or nothing, several processes.
 
-#![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
-
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 #![expect(clippy::cast_possible_truncation, reason = "small whole numbers")]
 
@@ -672,10 +670,9 @@ fn model(stream: &[Said]) -> Tiles {
 fn covered(tiles: &Tiles) -> BTreeSet<([u32; 3], String)> {
     let mut voxels = BTreeSet::new();
     for (section, t, pyramid) in tiles.values() {
-        let corner = DVec2::new(t[4], t[5]).as_uvec2();
         for y in 0..SIZE.y {
             for x in 0..SIZE.x {
-                let voxel = [corner.x + x, corner.y + y, *section];
+                let voxel = [t[4] as u32 + x, t[5] as u32 + y, *section];
                 if voxel[0] < EXTENT.x && voxel[1] < EXTENT.y {
                     voxels.insert((voxel, format!("{pyramid} at {t:?}")));
                 }
