@@ -1,7 +1,7 @@
 //! Progress on a terminal as a bar, elsewhere as a line now and then.
 
 use std::io::IsTerminal;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -18,7 +18,15 @@ pub(crate) struct Shown {
     bar: Option<ProgressBar>,
     /// Tiles there will be, if that is known.
     total: Option<u64>,
-    last: Mutex<Option<(Instant, State)>>,
+    so_far: Mutex<SoFar>,
+}
+
+#[derive(Default)]
+struct SoFar {
+    /// What earlier runs did.
+    before: State,
+    /// What was told last, with what was before, and when a line was written last.
+    last: Option<(Instant, State)>,
 }
 
 impl Shown {
@@ -37,7 +45,15 @@ impl Shown {
             label,
             bar,
             total,
-            last: Mutex::new(None),
+            so_far: Mutex::default(),
+        }
+    }
+
+    /// The next run counts from 0 again; here, it goes on.
+    pub(crate) fn next_run(&self) {
+        let mut so_far = self.so_far();
+        if let Some((_, last)) = so_far.last {
+            so_far.before = last;
         }
     }
 
@@ -46,14 +62,13 @@ impl Shown {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        let last = self
-            .last
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .take();
-        if let Some((_, state)) = last {
+        if let Some((_, state)) = self.so_far().last.take() {
             self.line(&state);
         }
+    }
+
+    fn so_far(&self) -> MutexGuard<'_, SoFar> {
+        self.so_far.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn line(&self, state: &State) {
@@ -68,28 +83,32 @@ impl Shown {
 
 impl Progress for Shown {
     fn update(&self, state: &State) {
+        let mut so_far = self.so_far();
+        let before = so_far.before;
+        let state = State {
+            tiles: before.tiles + state.tiles,
+            pixels: before.pixels + state.pixels,
+            quarantined: before.quarantined + state.quarantined,
+            ..*state
+        };
         if let Some(bar) = &self.bar {
             let known = state.tiles + state.queued + state.waiting;
             bar.set_length(self.total.unwrap_or(0).max(known));
             bar.set_position(state.tiles);
-            bar.set_message(facts(state));
+            bar.set_message(facts(&state));
         }
         let now = now();
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        let due = last.is_none_or(|(at, _)| now - at >= LINES);
-        let changed = last.is_none_or(|(_, before)| {
-            (before.tiles, before.queued, before.waiting)
-                != (state.tiles, state.queued, state.waiting)
-        });
-        if self.bar.is_none() && due && changed {
-            self.line(state);
-        }
-        let shown = if due && changed {
-            now
-        } else {
-            last.map_or(now, |(at, _)| at)
+        let moved = |last: &State| {
+            (last.tiles, last.queued, last.waiting) != (state.tiles, state.queued, state.waiting)
         };
-        *last = Some((shown, *state));
+        let (written, news) = match &so_far.last {
+            Some((at, last)) => (*at, now - *at >= LINES && moved(last)),
+            None => (now, true),
+        };
+        if self.bar.is_none() && news {
+            self.line(&state);
+        }
+        so_far.last = Some((if news { now } else { written }, state));
     }
 
     fn notice(&self, text: &str) {

@@ -86,7 +86,7 @@ fn coarser_levels_are_the_source_s() {
             for chunk in VoxelBox::of_size(volume.chunks(level)).iter() {
                 let id = ChunkId {
                     channel: 0,
-                    level: level as u32,
+                    level: level.try_into().unwrap(),
                     chunk,
                 };
                 let response = served.get(&key(level, chunk)).await;

@@ -1,5 +1,7 @@
 //! A real server on a real socket, asked by a client that shares no code with it.
 
+#![expect(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
 mod chunks;
 mod described;
 mod events;

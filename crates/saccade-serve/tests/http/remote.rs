@@ -41,11 +41,14 @@ fn a_remote_source_follows() {
     run(async {
         let served = serve(Options::DEFAULT).await;
         let remote = RemoteSource::open(&served.url, "em").await.unwrap();
-        let mut x = 0;
+        let mut x = 0_u8;
         let change = async || {
             x += 13;
-            let voxels = VoxelBox::new(UVec3::new(x, 3, 2), UVec3::new(x + 5, 40, 19));
-            let values = vec![x as u8; voxels.voxels() as usize];
+            let voxels = VoxelBox::new(
+                UVec3::new(x.into(), 3, 2),
+                UVec3::new(u32::from(x) + 5, 40, 19),
+            );
+            let values: Vec<u8> = voxels.iter().map(|_| x).collect();
             served.source.set(voxels, &values).unwrap();
             voxels
         };

@@ -13,10 +13,13 @@ use serde_json::Value;
 
 use super::{header, run, serve, serve_source, volume};
 
+/// What becomes of a read; `None`: it never ends.
+type Trouble = fn(ChunkId) -> Option<ChunkError>;
+
 /// Answers every read the same way.
 struct Troubled {
     volume: Arc<Volume>,
-    trouble: fn(ChunkId) -> Option<ChunkError>,
+    trouble: Trouble,
 }
 
 impl VolumeSource for Troubled {
@@ -53,7 +56,7 @@ fn trouble_says_whether_to_ask_again() {
             retry_after: Duration::from_millis(2500),
         })
     }
-    let cases: [(fn(ChunkId) -> Option<ChunkError>, _, _); 4] = [
+    let cases: [(Trouble, _, _); 4] = [
         (late, StatusCode::SERVICE_UNAVAILABLE, Some("3")),
         (
             |id| failed(id, true),

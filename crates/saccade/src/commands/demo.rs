@@ -150,6 +150,7 @@ impl Demo {
                 async { Ok(ingest(&acquisition, archive, &following, &shown, &acquired).await?) },
             )?;
             // What was written last may not have been seen yet.
+            shown.next_run();
             ingest(&acquisition, archive, &rest, &shown, stop).await?;
             shown.finish();
             if self.once {

@@ -203,3 +203,38 @@ fn words_that_make_no_sense() {
         .unwrap();
     assert_failed(&output, 1, &["the overlap is 0.9", "between"]);
 }
+
+#[test]
+fn bad_tiles_are_set_aside_and_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let acquisition = folder.path().join("acquisition");
+    simulate(&acquisition, "100,90,3");
+    let deep: image::ImageBuffer<image::Luma<u16>, Vec<u16>> = image::ImageBuffer::new(20, 20);
+    deep.save(acquisition.join("tiles/deep.png")).unwrap();
+    let flat = image::GrayImage::from_pixel(20, 20, image::Luma([90]));
+    flat.save(acquisition.join("tiles/far.png")).unwrap();
+    std::fs::write(acquisition.join("tiles/torn.png"), "no image at all").unwrap();
+    let record = |name: &str, x: u32| {
+        format!(
+            "{{\"record\":\"tile\",\"tile\":\"{name}\",\"file\":\"tiles/{name}.png\",\"section\":1,\
+             \"size\":[20,20],\"transform\":[1,0,0,1,{x},0]}}\n"
+        )
+    };
+    let records = acquisition.join("tiles.jsonl");
+    let mut lines = std::fs::read_to_string(&records).unwrap();
+    lines.extend([record("deep", 0), record("far", 5000), record("torn", 0)]);
+    std::fs::write(&records, lines).unwrap();
+
+    let archive = folder.path().join("archive");
+    let output = run(["ingest", text(&acquisition), text(&archive), "--once"]);
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let summary = said.lines().last().unwrap();
+    assert!(
+        summary.contains("12 tiles taken in") && summary.contains("3 set aside"),
+        "{said}"
+    );
+    for part in ["deep.png", "16", "far", "outside the volume", "torn.png"] {
+        assert!(said.contains(part), "{part:?} is not in: {said}");
+    }
+}

@@ -1,5 +1,7 @@
 //! The program as people run it.
 
+#![expect(clippy::unwrap_used, reason = "helpers of tests are tests")]
+
 mod demo;
 mod errors;
 mod whole_way;
