@@ -289,15 +289,19 @@ fn start() -> Instant {
 
 /// What the user did to the picture.
 fn input_on(ui: &Ui, response: &Response) -> Input {
+    // All that asks the context comes first: asked from within `input`, it would wait for itself.
     let typing = ui.ctx().egui_wants_keyboard_input();
     let points = |v: egui::Vec2| dvec2(v.x.into(), v.y.into());
     let delta = points(response.drag_delta());
+    let over = response.hovered();
+    let dragged = response.dragged();
+    let primary = response.dragged_by(PointerButton::Primary);
+    let other =
+        response.dragged_by(PointerButton::Secondary) || response.dragged_by(PointerButton::Middle);
+    let double_clicked = response.double_clicked();
     ui.input(|i| {
-        let touch = i
-            .multi_touch()
-            .filter(|_| response.hovered() || response.dragged());
-        let drag = |buttons: &[PointerButton]| {
-            let held = buttons.iter().any(|&button| response.dragged_by(button));
+        let touch = i.multi_touch().filter(|_| over || dragged);
+        let drag = |held: bool| {
             if held && touch.is_none() {
                 delta
             } else {
@@ -306,20 +310,16 @@ fn input_on(ui: &Ui, response: &Response) -> Input {
         };
         let held = |key: Key| f64::from(u8::from(!typing && i.key_down(key)));
         let pressed = |key: Key| !typing && i.key_pressed(key);
-        let pinch = if response.hovered() {
-            f64::from(i.zoom_delta())
-        } else {
-            1.0
-        };
-        let wheel = if response.hovered() && touch.is_none() {
+        let pinch = if over { f64::from(i.zoom_delta()) } else { 1.0 };
+        let wheel = if over && touch.is_none() {
             i.smooth_scroll_delta().y
         } else {
             0.0
         };
         let closer = (held(Key::Plus) + held(Key::Equals)).min(1.0) - held(Key::Minus);
         Input {
-            primary: drag(&[PointerButton::Primary]),
-            other: drag(&[PointerButton::Secondary, PointerButton::Middle]),
+            primary: drag(primary),
+            other: drag(other),
             fingers: touch.map_or(DVec2::ZERO, |t| points(t.translation_delta)),
             pinch,
             wheel: wheel.into(),
@@ -329,8 +329,104 @@ fn input_on(ui: &Ui, response: &Response) -> Input {
             ),
             closer,
             shift: i.modifiers.shift,
-            reset: response.double_clicked() || pressed(Key::F) || pressed(Key::R),
+            reset: double_clicked || pressed(Key::F) || pressed(Key::R),
             seconds: f64::from(i.stable_dt.min(0.1)),
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use egui::{Context, Event, Modifiers, Pos2, RawInput, Rect, pos2, vec2};
+
+    use super::*;
+
+    /// A hand on a window without a screen.
+    #[derive(Default)]
+    struct Hand {
+        context: Context,
+        time: f64,
+    }
+
+    impl Hand {
+        fn frame(&mut self, events: Vec<Event>, modifiers: Modifiers) -> Input {
+            self.time += 0.02;
+            let screen = Rect::from_min_size(Pos2::ZERO, vec2(400.0, 300.0));
+            let input = RawInput {
+                screen_rect: Some(screen),
+                time: Some(self.time),
+                events,
+                modifiers,
+                ..RawInput::default()
+            };
+            let mut got = Input::default();
+            drop(self.context.run_ui(input, |ui| {
+                let id = ui.scope_id().with("scene");
+                let response = ui.interact(screen, id, Sense::click_and_drag());
+                got = input_on(ui, &response);
+            }));
+            got
+        }
+
+        /// Presses `button`, moves by 30 points to the right, lets go; all movements together.
+        fn drag(&mut self, button: PointerButton, modifiers: Modifiers) -> Input {
+            let press = |pos, pressed| Event::PointerButton {
+                pos,
+                button,
+                pressed,
+                modifiers,
+            };
+            let (from, to) = (pos2(100.0, 100.0), pos2(130.0, 100.0));
+            self.frame(vec![Event::PointerMoved(from)], modifiers);
+            self.frame(vec![press(from, true)], modifiers);
+            let first = self.frame(vec![Event::PointerMoved(pos2(115.0, 100.0))], modifiers);
+            let second = self.frame(vec![Event::PointerMoved(to)], modifiers);
+            self.frame(vec![press(to, false)], modifiers);
+            Input {
+                primary: first.primary + second.primary,
+                other: first.other + second.other,
+                ..second
+            }
+        }
+    }
+
+    #[test]
+    fn each_button_drags_its_own_way() {
+        let mut hand = Hand::default();
+        hand.frame(Vec::new(), Modifiers::NONE);
+        let by = dvec2(30.0, 0.0);
+        for (button, primary, other) in [
+            (PointerButton::Primary, by, DVec2::ZERO),
+            (PointerButton::Secondary, DVec2::ZERO, by),
+            (PointerButton::Middle, DVec2::ZERO, by),
+        ] {
+            let input = hand.drag(button, Modifiers::NONE);
+            assert_eq!((input.primary, input.other), (primary, other), "{button:?}");
+            assert!(!input.shift);
+        }
+        assert!(hand.drag(PointerButton::Primary, Modifiers::SHIFT).shift);
+        let still = hand.frame(Vec::new(), Modifiers::NONE);
+        assert_eq!((still.primary, still.other), (DVec2::ZERO, DVec2::ZERO));
+    }
+
+    #[test]
+    fn keys_are_held_and_pressed() {
+        let mut hand = Hand::default();
+        let press = |key, pressed| Event::Key {
+            key,
+            physical_key: None,
+            pressed,
+            repeat: false,
+            modifiers: Modifiers::NONE,
+        };
+        hand.frame(Vec::new(), Modifiers::NONE);
+        let input = hand.frame(vec![press(Key::ArrowLeft, true)], Modifiers::NONE);
+        assert_eq!(input.arrows, dvec2(-1.0, 0.0));
+        let input = hand.frame(Vec::new(), Modifiers::NONE);
+        assert_eq!(input.arrows, dvec2(-1.0, 0.0), "still held");
+        let input = hand.frame(vec![press(Key::ArrowLeft, false)], Modifiers::NONE);
+        assert_eq!(input.arrows, DVec2::ZERO);
+        assert!(hand.frame(vec![press(Key::F, true)], Modifiers::NONE).reset);
+        assert!(!hand.frame(Vec::new(), Modifiers::NONE).reset, "once");
+    }
 }

@@ -51,3 +51,5 @@ pub use page::{PageError, PageOptions};
 
 #[cfg(not(target_family = "wasm"))]
 pub use native::{SourceSpec, ViewError, run};
+#[cfg(target_family = "wasm")]
+pub use web::{start, status};
