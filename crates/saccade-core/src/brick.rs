@@ -128,11 +128,14 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    const CHANNELS: u32 = 1 << CHANNEL_BITS;
+    const LEVELS: u32 = 1 << LEVEL_BITS;
+
     proptest! {
         #[test]
         fn ids_are_reversible(
-            channel in 0..MAX_CHANNELS as u32,
-            level in 0..MAX_LEVELS as u32,
+            channel in 0..CHANNELS,
+            level in 0..LEVELS,
             x in 0..MAX_BRICKS_PER_AXIS,
             y in 0..MAX_BRICKS_PER_AXIS,
             z in 0..MAX_BRICKS_PER_AXIS,
@@ -145,8 +148,8 @@ mod tests {
 
     #[test]
     fn ids_never_wrap() {
-        assert!(BrickId::new(MAX_CHANNELS as u32, 0, UVec3::ZERO).is_err());
-        assert!(BrickId::new(0, MAX_LEVELS as u32, UVec3::ZERO).is_err());
+        assert!(BrickId::new(CHANNELS, 0, UVec3::ZERO).is_err());
+        assert!(BrickId::new(0, LEVELS, UVec3::ZERO).is_err());
         assert!(BrickId::new(0, 0, UVec3::new(0, 1 << 16, 0)).is_err());
         let largest = BrickId::new(0, 0, UVec3::new(62_499, 62_499, 7_812));
         assert!(

@@ -115,6 +115,7 @@ mod tests {
         for value in 1..=255_u8 {
             let bump = |c: f64, w: f64| (-((f64::from(value) - c) / w).powi(2)).exp();
             let count = 10_000.0 * bump(centre, width) + 1_000.0 * bump(tail_centre, width);
+            #[expect(clippy::cast_possible_truncation, reason = "at most 11,000")]
             histogram.add(&vec![value; count as usize]);
         }
         histogram

@@ -62,8 +62,12 @@ impl ColorMap {
     pub fn srgb(self, t: f32) -> [f32; 3] {
         let corners = self.corners();
         let last = corners.len() - 1;
-        // At most 5 corners: exact in f32; negative and NaN saturate to 0.
+        // At most 5 corners: exact in f32.
         let at = t.clamp(0.0, 1.0) * last as f32;
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "within 0..=4; NaN becomes 0"
+        )]
         let index = (at as usize).min(last - 1);
         let within = at - index as f32;
         let mix = |a: u8, b: u8| f32::from(a) + within * (f32::from(b) - f32::from(a));
