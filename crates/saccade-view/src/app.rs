@@ -18,7 +18,7 @@ use crate::navigate::{Input, moved};
 use crate::options::ViewOptions;
 use crate::panel::{self, Settings};
 use crate::picture::{Picture, Place};
-use crate::quality::{Events, Quality};
+use crate::quality::{Cost, Events, Quality};
 use crate::setup::gpu_of;
 use crate::transfer_editor::TransferEditor;
 
@@ -35,6 +35,7 @@ pub(crate) struct App {
     panel_open: bool,
     picture: Picture,
     quality: Quality,
+    cost: Cost,
     acquisition: Acquisition,
     status: Option<Status>,
     preview: bool,
@@ -112,6 +113,7 @@ impl App {
             panel_open: true,
             picture: Picture::default(),
             quality: Quality::new(software),
+            cost: Cost::default(),
             acquisition: Acquisition::new(surroundings.acquisition),
             status: None,
             preview: false,
@@ -173,7 +175,7 @@ impl App {
             moving,
             changed: std::mem::take(&mut self.changed),
             settled: self.status.as_ref().is_some_and(|status| status.settled),
-            full: self.full_frame_time(place),
+            cost: self.cost(place),
         };
         // A picture alone is always as it should be.
         let scale = if self.ui {
@@ -205,16 +207,16 @@ impl App {
         self.status = Some(status);
     }
 
-    /// Time that a picture of the place's full size takes, as far as known.
-    fn full_frame_time(&self, place: Place) -> Option<Duration> {
-        let status = self.status.as_ref()?;
-        let drawn = status.frame_size.as_dvec2().element_product();
-        let full = place.size.as_dvec2().element_product();
-        Some(
-            status
-                .frame_time?
-                .mul_f64((full / drawn.max(1.0)).clamp(0.0, 1e3)),
-        )
+    /// What pictures cost, with what the last frame told.
+    fn cost(&mut self, place: Place) -> Cost {
+        if let Some(status) = &self.status
+            && let Some(time) = status.frame_time
+        {
+            let drawn = status.frame_size.as_dvec2().element_product();
+            let full = place.size.as_dvec2().element_product();
+            self.cost.learn(drawn / full.max(1.0), time);
+        }
+        self.cost
     }
 
     fn publish_status(&self, status: &Status, view: &View) {

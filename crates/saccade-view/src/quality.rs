@@ -7,6 +7,8 @@ use std::time::Duration;
 const MOVING: Duration = Duration::from_millis(60);
 /// While data arrive, a picture that takes longer keeps the user interface waiting too long.
 const ARRIVING: Duration = Duration::from_millis(400);
+/// Of the time that any picture takes, so much is borne: making it smaller would not help.
+const ANYWAY: Duration = Duration::from_millis(150);
 /// Growing back needs this much room, so that the size does not flicker.
 const ROOM: f64 = 0.7;
 /// After so long without a movement the picture is refined.
@@ -35,8 +37,37 @@ pub(crate) struct Events {
     pub(crate) changed: bool,
     /// The last picture shows all it can, at the size it has.
     pub(crate) settled: bool,
-    /// Time that a picture of full size takes, as far as known.
-    pub(crate) full: Option<Duration>,
+    /// What pictures cost, as far as known.
+    pub(crate) cost: Cost,
+}
+
+/// What pictures cost, learned from those that were drawn.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Cost {
+    /// Time of any picture, however small.
+    least: Option<Duration>,
+    /// Time of one of full size.
+    full: Option<Duration>,
+}
+
+impl Cost {
+    /// Pictures up to this part of the full one say what even the smallest costs.
+    const SMALL: f64 = 1.0 / 15.0;
+
+    /// A picture with `part` of the full one's pixels took `time`.
+    ///
+    /// Small ones bound the full one's time from above: some of theirs does not grow with pixels.
+    pub(crate) fn learn(&mut self, part: f64, time: Duration) {
+        let part = part.clamp(1e-4, 1.0);
+        let bound = time.div_f64(part);
+        self.full = match self.full {
+            Some(full) if part < 1.0 => Some(full.min(bound)),
+            _ => Some(bound),
+        };
+        if part <= Self::SMALL {
+            self.least = Some(self.least.map_or(time, |least| least.min(time)));
+        }
+    }
 }
 
 /// Chooses the size of pictures.
@@ -69,8 +100,8 @@ impl Quality {
             other => other,
         };
         let step = match self.phase {
-            Phase::Moving(_) => self.fit(events.full, MOVING),
-            Phase::Arriving => self.fit(events.full, ARRIVING),
+            Phase::Moving(_) => self.fit(events.cost, MOVING),
+            Phase::Arriving => self.fit(events.cost, ARRIVING),
             Phase::Full => 0,
         };
         // A finished preview is followed by the full picture.
@@ -87,10 +118,12 @@ impl Quality {
         SCALES[step]
     }
 
-    /// The largest size whose picture takes no longer than `target`.
-    fn fit(&mut self, full: Option<Duration>, target: Duration) -> usize {
-        if let Some(full) = full {
-            let (full, target) = (full.as_secs_f64(), target.as_secs_f64());
+    /// The largest size whose picture takes no longer than `target`, beyond what any picture takes.
+    fn fit(&mut self, cost: Cost, target: Duration) -> usize {
+        if let Some(full) = cost.full {
+            let anyway = cost.least.unwrap_or_default().min(ANYWAY);
+            let target = (target + anyway).as_secs_f64();
+            let full = full.as_secs_f64();
             let fits = |step: usize, room: f64| full * SCALES[step].powi(2) <= room * target;
             while self.step + 1 < SCALES.len() && !fits(self.step, 1.0) {
                 self.step += 1;
@@ -120,8 +153,9 @@ mod tests {
     }
 
     fn events(full: u64) -> Events {
+        let full = Some(ms(full));
         Events {
-            full: Some(ms(full)),
+            cost: Cost { least: None, full },
             ..Events::default()
         }
     }
@@ -198,6 +232,42 @@ mod tests {
             };
             assert_eq!(quality.scale(ms(20), changed), scale, "{full} ms");
         }
+    }
+
+    #[test]
+    fn pictures_are_not_made_smaller_than_helps() {
+        let mut cost = Cost::default();
+        cost.learn(1.0, ms(3_500));
+        cost.learn(0.02, ms(400));
+        assert_eq!(
+            cost.full,
+            Some(ms(3_500)),
+            "a small picture says only 20 s at most"
+        );
+        let size = |cost| {
+            let events = Events {
+                moving: true,
+                cost,
+                ..Events::default()
+            };
+            Quality::new(false).scale(ms(0), events)
+        };
+        assert_eq!(size(cost), 0.18, "much of the 400 ms is spent anyway");
+        assert_eq!(
+            size(Cost {
+                least: None,
+                ..cost
+            }),
+            0.125
+        );
+        cost.learn(0.5, ms(1_000));
+        assert_eq!(cost.full, Some(ms(2_000)));
+        cost.learn(1.0, ms(5_000));
+        assert_eq!(
+            cost.full,
+            Some(ms(5_000)),
+            "the full one itself is believed"
+        );
     }
 
     #[test]
