@@ -1,2 +1,69 @@
-//! Benchmarks.
-fn main() {}
+//! Measures Saccade: one row per figure, as a table and as JSON.
+//!
+//! A row has an id that never changes its meaning, the median of its runs, the figure of a peer
+//! where one is published, the settings and the machine. The rows use the product's own crates
+//! as any program would; nothing in them exists for the benchmark.
+#![allow(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "a program that reports to its terminal"
+)]
+
+mod clock;
+mod cpu;
+mod machine;
+mod report;
+mod rows;
+mod scene;
+
+use std::fs;
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, bail};
+use clap::Parser;
+
+use crate::report::Report;
+
+/// Measure Saccade.
+#[derive(Parser)]
+struct Arguments {
+    /// Also write the rows to this file.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Rows to measure, by id; all when none is named.
+    #[arg(value_name = "ID")]
+    ids: Vec<String>,
+}
+
+fn main() -> Result<()> {
+    let arguments = Arguments::parse();
+    let wanted = wanted(&arguments.ids)?;
+    let mut report = Report::new(machine::Machine::here());
+    for group in wanted {
+        eprintln!("measuring {} ...", group.ids.join(", "));
+        let rows = (group.measure)().with_context(|| format!("measuring {}", group.ids[0]))?;
+        report.add(rows);
+        if let Some(file) = &arguments.json {
+            fs::write(file, report.json()?)
+                .with_context(|| format!("cannot write {}", file.display()))?;
+        }
+    }
+    println!("{report}");
+    Ok(())
+}
+
+/// The groups with at least one of the rows asked for.
+fn wanted(ids: &[String]) -> Result<Vec<&'static rows::Group>> {
+    let known: Vec<&str> = rows::GROUPS.iter().flat_map(|g| g.ids).copied().collect();
+    if let Some(unknown) = ids.iter().find(|id| !known.contains(&id.as_str())) {
+        bail!(
+            "there is no row {unknown:?}; the rows are {}",
+            known.join(", ")
+        );
+    }
+    let all = ids.is_empty();
+    let groups = rows::GROUPS.iter();
+    Ok(groups
+        .filter(|g| all || g.ids.iter().any(|id| ids.iter().any(|w| w == id)))
+        .collect())
+}

@@ -1,0 +1,42 @@
+//! The rows, in groups that are measured together.
+
+mod construct;
+mod first_light;
+mod ingest;
+mod render;
+
+use anyhow::Result;
+
+use crate::report::Row;
+
+/// Rows that share their set-up.
+pub(crate) struct Group {
+    pub(crate) ids: &'static [&'static str],
+    pub(crate) measure: fn() -> Result<Vec<Row>>,
+}
+
+pub(crate) static GROUPS: &[Group] = &[
+    Group {
+        ids: first_light::IDS,
+        measure: first_light::measure,
+    },
+    Group {
+        ids: ingest::IDS,
+        measure: ingest::measure,
+    },
+    Group {
+        ids: construct::IDS,
+        measure: construct::measure,
+    },
+    Group {
+        ids: render::IDS,
+        measure: render::measure,
+    },
+];
+
+/// A Tokio runtime as the command line uses it.
+fn runtime() -> Result<tokio::runtime::Runtime> {
+    Ok(tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()?)
+}
