@@ -53,8 +53,8 @@ fn remove_if_there(folder: &Path) -> Result<()> {
 
 /// Copies the files of `from`, which holds no folders.
 fn copy_files(from: &Path, to: &Path) -> Result<()> {
-    let entries =
-        fs::read_dir(from).with_context(|| format!("cannot read the page in {}", from.display()))?;
+    let entries = fs::read_dir(from)
+        .with_context(|| format!("cannot read the page in {}", from.display()))?;
     for entry in entries {
         let path = entry?.path();
         let name = path.file_name().context("a folder entry has a name")?;
