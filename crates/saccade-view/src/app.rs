@@ -351,14 +351,14 @@ mod tests {
     }
 
     impl Hand {
-        fn frame(&mut self, events: Vec<Event>, modifiers: Modifiers) -> Input {
+        fn frame(&mut self, mut events: Vec<Event>, modifiers: Modifiers) -> Input {
             self.time += 0.02;
+            events.insert(0, Event::ModifiersChanged(modifiers));
             let screen = Rect::from_min_size(Pos2::ZERO, vec2(400.0, 300.0));
             let input = RawInput {
                 screen_rect: Some(screen),
                 time: Some(self.time),
                 events,
-                modifiers,
                 ..RawInput::default()
             };
             let mut got = Input::default();

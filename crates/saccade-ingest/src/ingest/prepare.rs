@@ -221,7 +221,7 @@ pub(super) fn pyramid_name(volume: &str, record: &TileRecord, position: u64) -> 
     };
     let tile: String = record.tile.chars().take(100).map(plain).collect();
     format!(
-        "tiles/{volume}/{:06}/{tile}.{position:x}.tif",
+        "tiles/{volume}/{:06}/{tile}-{position:x}.tif",
         record.section
     )
 }
