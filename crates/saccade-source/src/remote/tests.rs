@@ -1,4 +1,5 @@
 #![allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
+#![expect(clippy::unwrap_used, reason = "helpers of tests fail as tests do")]
 
 mod server;
 

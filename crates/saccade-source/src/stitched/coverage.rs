@@ -315,7 +315,7 @@ mod tests {
         fn taking_leaves_the_rest(
             taken in prop::collection::vec((0..40_u32, 0..40_u32), 0..8),
         ) {
-            let mut left = vec![0..40];
+            let mut left = Vec::from_iter(std::iter::once(0..40));
             let mut seen = [false; 40];
             for (a, b) in taken {
                 let won = a.min(b)..a.max(b);
