@@ -37,6 +37,18 @@ pub(crate) fn size(text: &str) -> Result<UVec2, String> {
     )
 }
 
+/// Longest side of a picture [pixels].
+const LONGEST_SIDE: u32 = 16_384;
+
+/// Width and height of a picture, as `WxH`.
+pub(crate) fn picture_size(text: &str) -> Result<UVec2, String> {
+    let size = size(text)?;
+    if size.max_element() > LONGEST_SIDE {
+        return Err(format!("a side has {LONGEST_SIDE} pixels at most"));
+    }
+    Ok(size)
+}
+
 /// A time in seconds.
 pub(crate) fn seconds(text: &str) -> Result<std::time::Duration, String> {
     let seconds: f64 = text
@@ -93,6 +105,7 @@ mod tests {
         for bad in ["", "3,4", "3,4,5,6", "0,1,1", "-1,2,3", "1.5,1,1", "a,b,c"] {
             assert!(extent(bad).is_err(), "{bad}");
         }
+        assert!(picture_size("16384x1").is_ok() && picture_size("1x16385").is_err());
         assert!(size("0x4").is_err() && size("64").is_err() && size("64x64x64").is_err());
         assert!(voxel_nm("4,4,0").is_err() && voxel_nm("4,nan,4").is_err());
         assert!(rate("0").is_err() && rate("-1").is_err() && rate("fast").is_err());

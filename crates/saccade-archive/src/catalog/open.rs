@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use sqlx::migrate::{MigrateError, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{ConnectOptions, SqliteConnection, SqlitePool};
+use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
 
@@ -38,6 +38,12 @@ pub(super) async fn open(path: &Path) -> Result<(SqlitePool, SqlitePool), Catalo
     let writer = SqlitePoolOptions::new()
         .max_connections(1)
         .acquire_timeout(BUSY)
+        // On a full disk SQLite may end a transaction by itself, and the connection then takes it
+        // for open for ever: such a one is replaced.
+        .before_acquire(|connection, _| {
+            let usable = !connection.is_in_transaction();
+            Box::pin(async move { Ok(usable) })
+        })
         .connect_with(options(path).create_if_missing(true))
         .await
         .map_err(failed)?;
@@ -146,5 +152,27 @@ async fn refuse_foreign_database(
         })
     } else {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_transaction_that_sqlite_ended_holds_up_no_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let (writer, _readers) = open(&folder.path().join("catalog.sqlite")).await.unwrap();
+        for _ in 0..3 {
+            let mut transaction = writer.begin_with("BEGIN IMMEDIATE").await.unwrap();
+            // What SQLite does when the disk is full.
+            sqlx::raw_sql("ROLLBACK")
+                .execute(&mut *transaction)
+                .await
+                .unwrap();
+            drop(transaction);
+        }
+        let transaction = writer.begin_with("BEGIN IMMEDIATE").await.unwrap();
+        transaction.commit().await.unwrap();
     }
 }

@@ -1,6 +1,6 @@
 //! `saccade ingest`: from what a microscope writes to what can be looked at.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::Args;
@@ -60,10 +60,36 @@ impl Stored {
     }
 }
 
+/// The acquisition archive is only read: nothing is made in or around it.
+fn refuse_same_folder(acquisition: &Path, archive: &Path) -> Result<()> {
+    let Ok(theirs) = acquisition.canonicalize() else {
+        return Ok(());
+    };
+    // The archive may not exist yet; its nearest parent that does tells where it would be.
+    let mut existing = std::path::absolute(archive)?;
+    let mut missing = PathBuf::new();
+    while !existing.exists() {
+        let name = existing.file_name().unwrap_or_default().to_owned();
+        missing = Path::new(&name).join(missing);
+        if !existing.pop() {
+            break;
+        }
+    }
+    let ours = existing.canonicalize()?.join(missing);
+    let within = ours.starts_with(&theirs) || (ours.exists() && theirs.starts_with(&ours));
+    anyhow::ensure!(
+        !within,
+        "the microscope's folder is only read: name another folder for the archive than {}",
+        archive.display()
+    );
+    Ok(())
+}
+
 impl Ingest {
     pub(crate) async fn run(self) -> Result<()> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
         saccade_archive::acquisition::AcquisitionInfo::read(&self.acquisition)?;
+        refuse_same_folder(&self.acquisition, &self.archive)?;
         let archive = VisualizationArchive::create(&self.archive).await?;
         let options = IngestOptions {
             volume: self.volume,
@@ -90,5 +116,32 @@ impl Ingest {
             self.archive.display()
         ));
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_microscope_keeps_its_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let acquisition = folder.path().join("acquisition");
+        std::fs::create_dir(&acquisition).unwrap();
+        let inside = acquisition.join("a/b");
+        let around = acquisition.join("../acquisition");
+        for bad in [acquisition.as_path(), &inside, &around, folder.path()] {
+            assert!(
+                refuse_same_folder(&acquisition, bad).is_err(),
+                "{}",
+                bad.display()
+            );
+        }
+        for good in ["archive", "acquisition2", "deep/archive"] {
+            assert!(
+                refuse_same_folder(&acquisition, &folder.path().join(good)).is_ok(),
+                "{good}"
+            );
+        }
     }
 }

@@ -12,7 +12,7 @@ use saccade_render::{Gpu, View};
 use saccade_stream::{Session, SessionOptions, SettleError, Status};
 use saccade_view::background_from_text;
 
-use crate::arguments::{seconds, size};
+use crate::arguments::{picture_size, seconds};
 use crate::open::Place;
 use crate::report::tell;
 
@@ -37,7 +37,7 @@ pub(crate) struct Render {
     camera: Option<Camera>,
 
     /// Size of the picture [pixels]
-    #[arg(long, value_name = "WxH", value_parser = size, default_value = "1280x720")]
+    #[arg(long, value_name = "WxH", value_parser = picture_size, default_value = "1280x720")]
     size: UVec2,
 
     /// Colours and opacities: auto, a JSON file, or JSON itself
