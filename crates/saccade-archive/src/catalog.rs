@@ -197,8 +197,9 @@ pub struct Catalog {
 #[derive(Debug)]
 struct Inner {
     path: Box<Path>,
+    access: open::Access,
     /// One connection: SQLite lets one write at a time, and waiting here costs no time-out.
-    writer: SqlitePool,
+    writer: Option<SqlitePool>,
     readers: SqlitePool,
     watcher: watcher::Watcher,
 }
@@ -206,10 +207,14 @@ struct Inner {
 impl Catalog {
     /// Opens a catalog that exists.
     ///
+    /// A file that may not be written, for its permissions or on a read-only file system, is opened
+    /// for reading: commits are then refused with [`CatalogError::ReadOnly`]. Changes are followed
+    /// only if somebody is writing when it is opened; else it is taken for finished.
+    ///
     /// # Errors
     ///
     /// [`CatalogError::NotFound`], [`CatalogError::NotACatalog`], [`CatalogError::NewerSchema`],
-    /// [`CatalogError::NetworkFilesystem`], or what SQLite says.
+    /// [`CatalogError::OlderSchema`], [`CatalogError::NetworkFilesystem`], or what SQLite says.
     pub async fn open(path: &Path) -> Result<Self, CatalogError> {
         if !path.is_file() {
             return Err(CatalogError::NotFound {
@@ -225,17 +230,30 @@ impl Catalog {
     ///
     /// As [`Self::open`].
     pub async fn create(path: &Path) -> Result<Self, CatalogError> {
-        let (writer, readers) = open::open(path).await?;
-        let watcher = watcher::Watcher::default();
+        Ok(Self::of(path, open::open(path).await?))
+    }
+
+    fn of(path: &Path, opened: open::Opened) -> Self {
         let inner = Inner {
             path: path.into(),
-            writer,
-            readers,
-            watcher,
+            access: opened.access,
+            writer: opened.writer,
+            readers: opened.readers,
+            watcher: watcher::Watcher::default(),
         };
-        Ok(Self {
+        Self {
             inner: Arc::new(inner),
-        })
+        }
+    }
+
+    /// The connection that writes.
+    fn writer(&self) -> Result<&SqlitePool, CatalogError> {
+        self.inner
+            .writer
+            .as_ref()
+            .ok_or_else(|| CatalogError::ReadOnly {
+                path: self.path().to_owned(),
+            })
     }
 
     /// The file.
@@ -255,7 +273,7 @@ impl Catalog {
         sqlx::query("INSERT INTO volumes (name, description) VALUES (?, ?) ON CONFLICT DO NOTHING")
             .bind(&volume.name)
             .bind(description)
-            .execute(&self.inner.writer)
+            .execute(self.writer()?)
             .await
             .map_err(|e| self.failed(e))?;
         let there = self.volume(&volume.name).await?;
@@ -586,7 +604,9 @@ impl Catalog {
     /// Ends all connections. Without it they end when the last clone is dropped, in their own time.
     pub async fn close(&self) {
         self.inner.readers.close().await;
-        self.inner.writer.close().await;
+        if let Some(writer) = &self.inner.writer {
+            writer.close().await;
+        }
     }
 
     async fn volume_id(&self, name: &str) -> Result<i64, CatalogError> {

@@ -64,7 +64,7 @@ struct Existing {
 impl<'c> Commit<'c> {
     pub(super) async fn begin(catalog: &'c Catalog, volume: &str) -> Result<Self, CatalogError> {
         // IMMEDIATE: a transaction that begins by reading could not always go on to write.
-        let begun = catalog.inner.writer.begin_with("BEGIN IMMEDIATE").await;
+        let begun = catalog.writer()?.begin_with("BEGIN IMMEDIATE").await;
         let mut transaction = begun.map_err(|e| catalog.failed(e))?;
         let query = "SELECT id, description, revision, tiles FROM volumes WHERE name = ?";
         let row = sqlx::query(query)

@@ -35,6 +35,30 @@ pub enum CatalogError {
         /// The file.
         path: PathBuf,
     },
+    /// An older Saccade wrote it, and it may only be read.
+    #[error(
+        "the catalog was written by an older Saccade (schema {found}, this one needs {known}) and may \
+         only be read here; open it once where it may be written: {}",
+        path.display()
+    )]
+    OlderSchema {
+        /// Schema of the file.
+        found: i64,
+        /// Schema of this program.
+        known: i64,
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file may only be read.
+    #[error(
+        "the catalog may only be read: check the permissions of its folder, or whether the file \
+         system is mounted read-only: {}",
+        path.display()
+    )]
+    ReadOnly {
+        /// The file.
+        path: PathBuf,
+    },
     /// SQLite's write-ahead log needs memory that processes share, which network file systems lack.
     #[error(
         "the catalog cannot live on a network file system ({kind}), where SQLite may lose data; put \
@@ -139,13 +163,20 @@ impl CatalogError {
     pub fn is_transient(&self) -> bool {
         match self {
             Self::Full { .. } => true,
-            // SQLITE_BUSY, SQLITE_LOCKED, SQLITE_IOERR.
+            // SQLITE_IOERR.
             Self::Database { source, .. } => {
-                matches!(primary_code(source), Some(5 | 6 | 10))
+                self.is_busy()
+                    || primary_code(source) == Some(10)
                     || matches!(source, sqlx::Error::PoolTimedOut)
             }
             _ => false,
         }
+    }
+
+    /// Whether another connection was in the way.
+    pub(super) fn is_busy(&self) -> bool {
+        // SQLITE_BUSY, SQLITE_LOCKED.
+        matches!(self, Self::Database { source, .. } if matches!(primary_code(source), Some(5 | 6)))
     }
 }
 

@@ -1,8 +1,9 @@
 //! Opening the file: what it may be, how it is used, which schema it has.
 
+use std::cmp::Ordering;
 use std::fs::File;
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use sqlx::migrate::{MigrateError, Migrator};
@@ -19,40 +20,134 @@ const APPLICATION_ID: i64 = 0x5361_6363;
 /// How long to wait for another process' transaction.
 const BUSY: Duration = Duration::from_secs(20);
 
-pub(super) fn options(path: &Path) -> SqliteConnectOptions {
-    SqliteConnectOptions::new()
-        .filename(path)
-        .journal_mode(SqliteJournalMode::Wal)
-        // NORMAL would lose acknowledged tiles at a power cut.
-        .synchronous(SqliteSynchronous::Full)
-        .busy_timeout(BUSY)
-        .foreign_keys(true)
-        .disable_statement_logging()
+/// What may be done with the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Access {
+    /// Everything.
+    Write,
+    /// Looking, while others may write.
+    Read,
+    /// Looking. Nobody was writing when it was opened, and there is no place for the shared memory
+    /// through which a writer would tell of himself.
+    ReadUnchanging,
 }
 
-/// Opens the file for writing and for reading, makes it if it is missing.
-pub(super) async fn open(path: &Path) -> Result<(SqlitePool, SqlitePool), CatalogError> {
+pub(super) fn options(path: &Path, access: Access) -> SqliteConnectOptions {
+    let options = SqliteConnectOptions::new()
+        .filename(path)
+        .busy_timeout(BUSY)
+        .disable_statement_logging();
+    match access {
+        Access::Write => options
+            .journal_mode(SqliteJournalMode::Wal)
+            // NORMAL would lose acknowledged tiles at a power cut.
+            .synchronous(SqliteSynchronous::Full)
+            .foreign_keys(true),
+        Access::Read => options.read_only(true),
+        Access::ReadUnchanging => options.read_only(true).immutable(true),
+    }
+}
+
+/// The connections to an open file.
+pub(super) struct Opened {
+    pub(super) access: Access,
+    /// One connection; none if the file may only be read.
+    pub(super) writer: Option<SqlitePool>,
+    pub(super) readers: SqlitePool,
+}
+
+/// Opens the file: for writing if that is allowed, and then makes it if it is missing; else for
+/// reading.
+pub(super) async fn open(path: &Path) -> Result<Opened, CatalogError> {
     refuse_foreign_file(path)?;
+    if is_write_protected(path) {
+        open_to_read(path).await
+    } else {
+        open_to_write(path).await
+    }
+}
+
+async fn open_to_write(path: &Path) -> Result<Opened, CatalogError> {
     refuse_network(path)?;
-    let failed = |e| CatalogError::from_sqlite(e, path);
+    let access = Access::Write;
     let writer = SqlitePoolOptions::new()
         .max_connections(1)
-        .acquire_timeout(BUSY)
         // On a full disk SQLite may end a transaction by itself, and the connection then takes it
         // for open for ever: such a one is replaced.
         .before_acquire(|connection, _| {
             let usable = !connection.is_in_transaction();
             Box::pin(async move { Ok(usable) })
-        })
-        .connect_with(options(path).create_if_missing(true))
-        .await
-        .map_err(failed)?;
+        });
+    let options = options(path, access).create_if_missing(true);
+    let writer = connect(writer, options, path).await?;
     migrate(&writer, path).await?;
-    let readers = SqlitePoolOptions::new()
-        .max_connections(4)
-        .acquire_timeout(BUSY);
-    let readers = readers.connect_with(options(path)).await.map_err(failed)?;
-    Ok((writer, readers))
+    let readers = open_readers(path, access).await?;
+    Ok(Opened {
+        access,
+        writer: Some(writer),
+        readers,
+    })
+}
+
+pub(super) async fn open_to_read(path: &Path) -> Result<Opened, CatalogError> {
+    // SQLite removes the log when the last writer is done.
+    let access = if log_of(path).exists() {
+        refuse_network(path)?;
+        Access::Read
+    } else {
+        Access::ReadUnchanging
+    };
+    let readers = open_readers(path, access).await?;
+    refuse_other_schema(&readers, path).await?;
+    Ok(Opened {
+        access,
+        writer: None,
+        readers,
+    })
+}
+
+async fn open_readers(path: &Path, access: Access) -> Result<SqlitePool, CatalogError> {
+    let readers = SqlitePoolOptions::new().max_connections(4);
+    connect(readers, options(path, access), path).await
+}
+
+/// Opens a pool. Where two processes open a new file at once, the switch to the write-ahead log is
+/// refused to one of them, whatever the time-out: that one tries again.
+async fn connect(
+    pool: SqlitePoolOptions,
+    options: SqliteConnectOptions,
+    path: &Path,
+) -> Result<SqlitePool, CatalogError> {
+    const TRIES: u32 = 100;
+    let pool = pool.acquire_timeout(BUSY);
+    let mut tries = 0;
+    loop {
+        match pool.clone().connect_with(options.clone()).await {
+            Ok(pool) => return Ok(pool),
+            Err(e) => {
+                let error = CatalogError::from_sqlite(e, path);
+                tries += 1;
+                if !error.is_busy() || tries == TRIES {
+                    return Err(error);
+                }
+                tokio::time::sleep(BUSY / TRIES).await;
+            }
+        }
+    }
+}
+
+/// Whether the file is there, but may not be changed: permissions, or a read-only file system.
+fn is_write_protected(path: &Path) -> bool {
+    use std::io::ErrorKind::{PermissionDenied, ReadOnlyFilesystem};
+    let opened = File::options().write(true).open(path);
+    opened.is_err_and(|e| matches!(e.kind(), PermissionDenied | ReadOnlyFilesystem))
+}
+
+/// SQLite's write-ahead log.
+pub(super) fn log_of(path: &Path) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push("-wal");
+    name.into()
 }
 
 /// A file that is not SQLite's is refused before SQLite touches it.
@@ -115,12 +210,7 @@ async fn migrate(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
         match MIGRATOR.run_direct(None, &mut *connection, false).await {
             Ok(()) => return Ok(()),
             Err(MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _)) => {
-                let known = MIGRATOR.iter().map(|m| m.version).max().unwrap_or(0);
-                return Err(CatalogError::NewerSchema {
-                    found,
-                    known,
-                    path: path.to_owned(),
-                });
+                return Err(newer_schema(found, path));
             }
             Err(e @ (MigrateError::Execute(_) | MigrateError::ExecuteMigration(..)))
                 if attempts < 20 =>
@@ -131,6 +221,36 @@ async fn migrate(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
             }
             Err(e) => return Err(failed(sqlx::Error::Migrate(Box::new(e)))),
         }
+    }
+}
+
+fn known_schema() -> i64 {
+    MIGRATOR.iter().map(|m| m.version).max().unwrap_or(0)
+}
+
+fn newer_schema(found: i64, path: &Path) -> CatalogError {
+    CatalogError::NewerSchema {
+        found,
+        known: known_schema(),
+        path: path.to_owned(),
+    }
+}
+
+/// A file that may only be read must have this program's schema already.
+async fn refuse_other_schema(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
+    let failed = |e| CatalogError::from_sqlite(e, path);
+    let mut connection = pool.acquire().await.map_err(failed)?;
+    refuse_foreign_database(&mut connection, path).await?;
+    let query = sqlx::query_scalar("SELECT coalesce(max(version), 0) FROM _sqlx_migrations");
+    let found: i64 = query.fetch_one(&mut *connection).await.map_err(failed)?;
+    match found.cmp(&known_schema()) {
+        Ordering::Equal => Ok(()),
+        Ordering::Greater => Err(newer_schema(found, path)),
+        Ordering::Less => Err(CatalogError::OlderSchema {
+            found,
+            known: known_schema(),
+            path: path.to_owned(),
+        }),
     }
 }
 
@@ -157,12 +277,18 @@ async fn refuse_foreign_database(
 
 #[cfg(test)]
 mod tests {
+    use glam::{DVec3, UVec2, UVec3};
+    use saccade_core::transform::SectionFromTile;
+    use saccade_core::volume::Volume;
+
     use super::*;
+    use crate::catalog::{Catalog, NewTile};
 
     #[tokio::test]
     async fn a_transaction_that_sqlite_ended_holds_up_no_other() {
         let folder = tempfile::tempdir().unwrap();
-        let (writer, _readers) = open(&folder.path().join("catalog.sqlite")).await.unwrap();
+        let opened = open(&folder.path().join("catalog.sqlite")).await.unwrap();
+        let writer = opened.writer.unwrap();
         for _ in 0..3 {
             let mut transaction = writer.begin_with("BEGIN IMMEDIATE").await.unwrap();
             // What SQLite does when the disk is full.
@@ -174,5 +300,93 @@ mod tests {
         }
         let transaction = writer.begin_with("BEGIN IMMEDIATE").await.unwrap();
         transaction.commit().await.unwrap();
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+    async fn a_new_file_may_be_opened_by_many_at_once() {
+        for _ in 0..60 {
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("catalog.sqlite");
+            let open = || {
+                tokio::spawn({
+                    let path = path.clone();
+                    async move { open(&path).await.map(|opened| opened.access) }
+                })
+            };
+            for opening in [open(), open(), open(), open(), open()] {
+                assert_eq!(opening.await.unwrap().unwrap(), Access::Write);
+            }
+        }
+    }
+
+    async fn written() -> (tempfile::TempDir, PathBuf, Catalog) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalog.sqlite");
+        let catalog = Catalog::create(&path).await.unwrap();
+        let volume = Volume::new("v", UVec3::new(64, 64, 4), DVec3::ONE).unwrap();
+        catalog.create_volume(&volume).await.unwrap();
+        catalog.commit_tile("v", &tile("a")).await.unwrap();
+        (folder, path, catalog)
+    }
+
+    fn tile(name: &str) -> NewTile {
+        NewTile {
+            name: name.to_owned(),
+            section: 0,
+            size: UVec2::splat(8),
+            transform: SectionFromTile::translation(glam::DVec2::ZERO),
+            pyramid: format!("tiles/{name}"),
+            position: 0,
+        }
+    }
+
+    async fn to_read(path: &Path) -> Catalog {
+        Catalog::of(path, open_to_read(path).await.unwrap())
+    }
+
+    #[tokio::test]
+    async fn who_may_only_read_follows_who_writes() {
+        let (_folder, path, writing) = written().await;
+        let reading = to_read(&path).await;
+        assert_eq!(reading.inner.access, Access::Read);
+        let mut heard = reading.subscribe("v").await.unwrap();
+        assert_eq!(*heard.borrow_and_update(), 1);
+        writing.commit_tile("v", &tile("b")).await.unwrap();
+        let hear = heard.wait_for(|revision| *revision == 2);
+        tokio::time::timeout(BUSY, hear).await.unwrap().unwrap();
+        assert_eq!(reading.section_tiles("v", 0).await.unwrap().len(), 2);
+        let refused = reading.commit_tile("v", &tile("c")).await.unwrap_err();
+        assert!(
+            matches!(refused, CatalogError::ReadOnly { .. }),
+            "{refused}"
+        );
+    }
+
+    #[tokio::test]
+    async fn a_finished_file_can_be_read_without_writing_beside_it() {
+        let (folder, path, writing) = written().await;
+        writing.close().await;
+        let reading = to_read(&path).await;
+        assert_eq!(reading.inner.access, Access::ReadUnchanging);
+        assert_eq!(reading.entry("v").await.unwrap().tiles, 1);
+        let files = std::fs::read_dir(folder.path()).unwrap().count();
+        assert_eq!(files, 1, "neither log nor shared memory");
+    }
+
+    #[tokio::test]
+    async fn other_schemas_cannot_be_read() {
+        let (_folder, path, writing) = written().await;
+        for (version, older) in [(known_schema() + 1, false), (0, true)] {
+            sqlx::query("UPDATE _sqlx_migrations SET version = ?")
+                .bind(version)
+                .execute(writing.writer().unwrap())
+                .await
+                .unwrap();
+            match open_to_read(&path).await.err().unwrap() {
+                CatalogError::OlderSchema { .. } => assert!(older),
+                CatalogError::NewerSchema { .. } => assert!(!older),
+                other => panic!("{other}"),
+            }
+        }
     }
 }

@@ -63,7 +63,9 @@ impl Drop for Polling {
 async fn poll(polling: Polling) {
     let mut connection = None;
     let mut seen = None;
+    let mut warned = false;
     while let Some(catalog) = polling.0.upgrade().filter(|c| !c.readers.is_closed()) {
+        warn_of_writers(&catalog, &mut warned);
         match look(&catalog, &mut connection, &mut seen).await {
             Ok(()) => {}
             Err(e) => {
@@ -73,6 +75,16 @@ async fn poll(polling: Polling) {
         }
         drop(catalog);
         tokio::time::sleep(POLL).await;
+    }
+}
+
+/// Says once that a file which nobody was writing when it was opened is being written now.
+fn warn_of_writers(catalog: &Inner, warned: &mut bool) {
+    let unchanging = catalog.access == open::Access::ReadUnchanging;
+    if unchanging && !*warned && open::log_of(&catalog.path).exists() {
+        *warned = true;
+        let path = catalog.path.display();
+        log::warn!("the catalog is being written again; open it anew to see what is new: {path}");
     }
 }
 
@@ -86,7 +98,11 @@ async fn look(
         None => {
             // The counter only has meaning within one connection.
             *seen = None;
-            connection.insert(open::options(&catalog.path).connect().await?)
+            connection.insert(
+                open::options(&catalog.path, catalog.access)
+                    .connect()
+                    .await?,
+            )
         }
     };
     let version: i64 = sqlx::query_scalar("PRAGMA data_version")
