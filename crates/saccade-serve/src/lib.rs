@@ -8,17 +8,28 @@
 //! | address | what |
 //! |---|---|
 //! | `/` | the browser application |
+//! | `/volumes` | a page that lists the volumes, with links that open them in other viewers |
 //! | `/volumes.json` | names and revisions |
-//! | `/v/NAME/volume.json` | the description and the revision |
+//! | `/v/NAME/volume.json` | the description, the revision and the version |
 //! | `/v/NAME/status.json` | tiles, sections, files set aside |
 //! | `/v/NAME/events` | server-sent events, one per change |
+//! | `/v/NAME/thumbnail.png` | one section of a coarse level |
 //! | `/v/NAME/zarr/…` | OME-Zarr 0.5 |
+//! | `/v/NAME/zarr2/…` | OME-Zarr 0.4 |
+//! | `/v/NAME/precomputed/…` | Neuroglancer precomputed |
+//! | `/v/NAME/at/VERSION/zarr/…`, and so on | the same, for clients that never ask again |
+//!
+//! Voxels carry a strong tag and are to be asked for again each time (`Cache-Control: no-cache`).
+//! Below `at/VERSION` they are what they are now, too; those that have not changed since that
+//! version may be kept for good.
 //!
 //! # Spaces and shapes
 //!
-//! Arrays are `[c, z, y, x]` with chunks of `[1, cz, cy, cx]`; this is where x, y, z turns around.
-//! Scales are nanometres per voxel. The origin is the middle of voxel 0 of level 0, so a level whose
-//! voxels average several is moved by half the difference. Boxes in events are level-0 voxels.
+//! In OME-Zarr arrays are `[c, z, y, x]` with chunks of `[1, cz, cy, cx]`; this is where x, y, z
+//! turns around. Scales are nanometres per voxel. The origin is the middle of voxel 0 of level 0, so
+//! a level whose voxels average several is moved by half the difference. Precomputed has x, y, z, its
+//! origin at the corner of voxel 0, and chunks that end where the volume does. Boxes in events are
+//! level-0 voxels.
 //!
 //! # Failure
 //!
@@ -40,13 +51,16 @@
 mod archive;
 mod assets;
 mod events;
+mod formats;
 mod history;
 mod http;
+mod index;
+mod pieces;
 mod routes;
 mod server;
 mod status;
+mod thumbnail;
 mod volumes;
-mod zarr;
 
 pub use archive::{OfferError, follow_archive, offer_archive};
 pub use server::{Compress, Options, ServeError, Server};

@@ -21,11 +21,14 @@ use tower_http::cors::{Any, CorsLayer};
 
 use crate::assets::asset;
 use crate::events;
+use crate::formats::{Entry, Format, Unknown};
 use crate::http::{internal, mark_encoding, not_found};
+use crate::index::index;
+use crate::pieces::piece;
 use crate::server::{Compress, Compressible, Options};
 use crate::status::Status;
+use crate::thumbnail::thumbnail;
 use crate::volumes::{Published, Volumes};
-use crate::zarr::{Key, array, chunk, group};
 
 /// What every handler needs.
 #[derive(Clone)]
@@ -56,12 +59,29 @@ pub(crate) fn router(app: App) -> Router {
     let gzip = CompressionLayer::new()
         .quality(CompressionLevel::Fastest)
         .compress_when(marked);
-    Router::new()
+    let mut router = Router::new();
+    for format in Format::ALL {
+        let now = move |app, Path((name, key)): Path<(String, String)>, headers| {
+            object(app, format, name, None, key, headers)
+        };
+        let then = move |app, Path((name, at, key)): Path<(String, String, String)>, headers| {
+            object(app, format, name, Some(at), key, headers)
+        };
+        let folder = format.folder();
+        router = router
+            .route(&format!("/v/{{name}}/{folder}/{{*key}}"), get(now))
+            .route(
+                &format!("/v/{{name}}/at/{{version}}/{folder}/{{*key}}"),
+                get(then),
+            );
+    }
+    router
+        .route("/volumes", get(list))
         .route("/volumes.json", get(volumes))
         .route("/v/{name}/volume.json", get(volume))
         .route("/v/{name}/status.json", get(status))
         .route("/v/{name}/events", get(changes))
-        .route("/v/{name}/zarr/{*key}", get(zarr))
+        .route("/v/{name}/thumbnail.png", get(picture))
         .fallback(get(other))
         .layer(from_fn_with_state(app.clone(), spare_near_clients))
         .layer(gzip)
@@ -112,7 +132,8 @@ async fn volume(State(app): State<App>, Path(name): Path<String>) -> Response {
         Err(refusal) => return *refusal,
     };
     let revision = published.history().revision();
-    described(json!({ "volume": **published.volume(), "revision": revision }))
+    let version = published.version();
+    described(json!({ "volume": **published.volume(), "revision": revision, "version": version }))
 }
 
 async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
@@ -142,34 +163,41 @@ async fn changes(State(app): State<App>, Path(name): Path<String>, headers: Head
     }
 }
 
-async fn zarr(
+async fn list(State(app): State<App>, headers: HeaderMap) -> Response {
+    index(&app.volumes, &headers)
+}
+
+async fn picture(State(app): State<App>, Path(name): Path<String>, headers: HeaderMap) -> Response {
+    match find(&app, &name) {
+        Ok(published) => thumbnail(&published, &headers, app.options.patience).await,
+        Err(refusal) => *refusal,
+    }
+}
+
+/// An object of a volume in a format, as it is now, whatever version the address names.
+async fn object(
     State(app): State<App>,
-    Path((name, key)): Path<(String, String)>,
+    format: Format,
+    name: String,
+    version: Option<String>,
+    key: String,
     headers: HeaderMap,
 ) -> Response {
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,
     };
-    let volume = published.volume();
-    match Key::parse(&key) {
-        Some(Key::Group) => described(group(volume)),
-        Some(Key::Array { level }) => match array(volume, level) {
-            Some(metadata) => described(metadata),
-            None => {
-                let levels = (0..volume.levels.len()).map(|level| format!("{level}/zarr.json"));
-                not_found(
-                    format!("volume {name:?} has no level {level}"),
-                    levels.collect(),
-                )
-            }
-        },
-        Some(Key::Chunk(id)) => chunk(&published, id, &headers, app.options.patience).await,
-        None => {
-            let keys = ["zarr.json", "LEVEL/zarr.json", "LEVEL/c/C/Z/Y/X"];
+    match format.entry(published.volume(), &key) {
+        Ok(Entry::Metadata(metadata)) => described(metadata),
+        Ok(Entry::Piece(wanted)) => {
+            let patience = app.options.patience;
+            piece(&published, &wanted, version.as_deref(), &headers, patience).await
+        }
+        Err(Unknown { known }) => {
+            let folder = format.folder();
             not_found(
-                format!("there is no {key:?} in an image"),
-                keys.map(Into::into).to_vec(),
+                format!("there is no {key:?} in {folder}/ of volume {name:?}"),
+                known,
             )
         }
     }
@@ -178,10 +206,14 @@ async fn zarr(
 /// The application's files, and everything that does not exist.
 async fn other(State(app): State<App>, uri: Uri, headers: HeaderMap) -> Response {
     asset(uri.path(), &headers).unwrap_or_else(|| {
-        let mut known = vec!["/".to_owned(), "/volumes.json".to_owned()];
+        let mut known = ["/", "/volumes", "/volumes.json"]
+            .map(str::to_owned)
+            .to_vec();
         for name in app.volumes.names() {
-            let files = ["volume.json", "status.json", "events", "zarr/zarr.json"];
+            let files = ["volume.json", "status.json", "events", "thumbnail.png"];
             known.extend(files.map(|file| format!("/v/{name}/{file}")));
+            let roots = Format::ALL.map(|f| format!("/v/{name}/{}/{}", f.folder(), f.root()));
+            known.extend(roots);
         }
         not_found(format!("there is nothing at {:?}", uri.path()), known)
     })

@@ -5,13 +5,14 @@ use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use futures::StreamExt;
+use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_source::{ChunkId, VolumeSource};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use crate::history::History;
+use crate::history::{Cursor, History};
 use crate::http::Tag;
 use crate::status::StatusSource;
 
@@ -79,7 +80,10 @@ pub(crate) struct Published {
 }
 
 impl Published {
-    fn new(source: Arc<dyn VolumeSource>, status: Option<Arc<dyn StatusSource>>) -> Self {
+    pub(crate) fn new(
+        source: Arc<dyn VolumeSource>,
+        status: Option<Arc<dyn StatusSource>>,
+    ) -> Self {
         // Listen first: a change that comes now is then in the revision, in the stream or in both.
         let mut changes = source.changes();
         let revision = source.revision();
@@ -125,16 +129,54 @@ impl Published {
         self.end.clone()
     }
 
-    /// Names the state of a chunk: equal tags, equal bytes. `None` for no such chunk.
-    pub(crate) fn tag(&self, id: ChunkId) -> Option<Tag> {
-        let volume = self.volume();
-        let level = volume.levels.get(usize::try_from(id.level).ok()?)?;
-        // Changes are boxes of level-0 voxels; the filters of coarser levels reach a voxel beyond.
-        let reach = u32::from(id.level > 0);
-        let touched = level.voxels_from_box(id.voxels(volume)?.grown(reach));
-        let touched = touched.intersection(VoxelBox::of_size(volume.extent()));
+    /// Names the state of a chunk of a level: equal tags, equal bytes.
+    pub(crate) fn tag(&self, (level, chunk): (u32, UVec3)) -> Tag {
+        let touched = self.touched(level, chunk);
         let position = self.history().last_touched(touched);
-        Some(Tag::new(&format!("{:016x}-{position}", self.instance)))
+        Tag::new(&format!("{:016x}-{position}", self.instance))
+    }
+
+    /// Names the state of the whole volume: in addresses, for clients that keep what they have and
+    /// never ask again.
+    pub(crate) fn version(&self) -> String {
+        let revision = self.history().revision();
+        format!("{:016x}-{revision}", self.instance)
+    }
+
+    /// Whether a chunk is still what it was in that version. `false` for a version of another
+    /// process, or longer ago than changes are remembered.
+    pub(crate) fn is_as_in(&self, version: &str, (level, chunk): (u32, UVec3)) -> bool {
+        let own = format!("{:016x}-", self.instance);
+        let revision = version.strip_prefix(&own).and_then(|r| r.parse().ok());
+        let Some(revision) = revision else {
+            return false;
+        };
+        let touched = self.touched(level, chunk);
+        let history = self.history();
+        match history.cursor(Some(revision)) {
+            Cursor::At(position) => history.last_touched(touched) <= position,
+            Cursor::Lost => false,
+        }
+    }
+
+    /// The level-0 voxels that a chunk is made of. All of them for a chunk that does not exist.
+    fn touched(&self, level: u32, chunk: UVec3) -> VoxelBox {
+        let volume = self.volume();
+        let whole = VoxelBox::of_size(volume.extent());
+        let id = ChunkId {
+            channel: 0,
+            level,
+            chunk,
+        };
+        let Some(voxels) = id.voxels(volume) else {
+            return whole;
+        };
+        // Changes are boxes of level-0 voxels; the filters of coarser levels reach a voxel beyond.
+        let reach = u32::from(level > 0);
+        let level = volume.levels[level as usize];
+        level
+            .voxels_from_box(voxels.grown(reach))
+            .intersection(whole)
     }
 }
 

@@ -5,6 +5,7 @@
 mod chunks;
 mod described;
 mod events;
+mod formats;
 mod remote;
 mod server;
 

@@ -1,0 +1,150 @@
+//! Neuroglancer precomputed: raw, unsharded.
+//!
+//! Axes are x, y, z as in the rest of this project, the origin is the corner of voxel 0, so levels
+//! need no translation, and chunks end where the volume does.
+
+use glam::UVec3;
+use saccade_core::volume::{Dtype, Volume};
+use saccade_core::voxel_box::VoxelBox;
+use serde_json::{Value, json};
+
+use super::{Entry, Piece, Unknown, has_chunk, level_index, number, only, per_level};
+
+/// What a key below the volume's root names.
+pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
+    let unknown = || only(&["info", "LEVEL/X0-X1_Y0-Y1_Z0-Z1"]);
+    if key == "info" {
+        return Ok(Entry::Metadata(info(volume)));
+    }
+    let (level, voxels) = key.split_once('/').ok_or_else(unknown)?;
+    let level = number(level).ok_or_else(unknown)?;
+    let voxels = bounds(voxels).ok_or_else(unknown)?;
+    piece(volume, level, voxels)
+        .map(Entry::Piece)
+        .ok_or_else(|| per_level(volume, &first_and_size(volume)))
+}
+
+fn info(volume: &Volume) -> Value {
+    let scale = |(level, geometry): (usize, &saccade_core::levels::Level)| {
+        json!({
+            "key": level.to_string(),
+            "size": geometry.extent.to_array(),
+            "voxel_offset": [0, 0, 0],
+            "resolution": (volume.voxel_nm * geometry.downsampling).to_array(),
+            "chunk_sizes": [volume.chunk.to_array()],
+            "encoding": "raw",
+        })
+    };
+    let data_type = match volume.dtype {
+        Dtype::Uint16 => "uint16",
+        _ => "uint8",
+    };
+    json!({
+        "@type": "neuroglancer_multiscale_volume",
+        "type": "image",
+        "data_type": data_type,
+        "num_channels": volume.channels.len(),
+        "scales": volume.levels.iter().enumerate().map(scale).collect::<Vec<_>>(),
+    })
+}
+
+/// The piece that covers exactly these voxels of a level.
+fn piece(volume: &Volume, level: u32, voxels: VoxelBox) -> Option<Piece> {
+    let extent = volume.levels[level_index(volume, level)?].extent;
+    let chunk = voxels.min / volume.chunk;
+    let first = has_chunk(volume, level, chunk).then(|| chunk * volume.chunk)?;
+    let whole = VoxelBox::new(first, first.saturating_add(volume.chunk).min(extent));
+    (voxels == whole).then(|| Piece {
+        level,
+        chunk,
+        channels: 0..u32::try_from(volume.channels.len()).unwrap_or(u32::MAX),
+        voxels: VoxelBox::of_size(whole.size()),
+    })
+}
+
+/// `x0-x1_y0-y1_z0-z1`.
+fn bounds(text: &str) -> Option<VoxelBox> {
+    let axis = |text: &str| {
+        let (first, end) = text.split_once('-')?;
+        Some((number(first)?, number(end)?))
+    };
+    let axes: Vec<_> = text.split('_').map(axis).collect::<Option<_>>()?;
+    let [x, y, z] = axes[..] else { return None };
+    let (min, max) = (UVec3::new(x.0, y.0, z.0), UVec3::new(x.1, y.1, z.1));
+    Some(VoxelBox::new(min, max))
+}
+
+/// An example with the size of chunks.
+fn first_and_size(volume: &Volume) -> String {
+    let UVec3 { x, y, z } = volume.chunk;
+    format!("L/0-{x}_0-{y}_0-{z}, chunks of {x} x {y} x {z} voxels that end with the level")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::formats::tests::volume;
+
+    #[test]
+    fn every_chunk_has_the_name_of_its_voxels() {
+        let volume = volume();
+        for (index, level) in volume.levels.iter().enumerate() {
+            let mut voxels = 0;
+            for chunk in VoxelBox::of_size(volume.chunks(index)).iter() {
+                let min = chunk * volume.chunk;
+                let max = (min + volume.chunk).min(level.extent);
+                let key = format!(
+                    "{index}/{}-{}_{}-{}_{}-{}",
+                    min.x, max.x, min.y, max.y, min.z, max.z
+                );
+                let Ok(Entry::Piece(piece)) = entry(&volume, &key) else {
+                    panic!("{key}")
+                };
+                assert_eq!(
+                    (piece.chunk, piece.channels.clone()),
+                    (chunk, 0..1),
+                    "{key}"
+                );
+                assert_eq!(piece.voxels, VoxelBox::of_size(max - min), "{key}");
+                voxels += piece.voxels.voxels();
+            }
+            assert_eq!(voxels, VoxelBox::of_size(level.extent).voxels());
+        }
+    }
+
+    #[test]
+    fn other_boxes_do_not_exist() {
+        let others = [
+            "0/0-64_0-48_0-31",
+            "0/1-65_0-48_0-32",
+            "0/960-1024_0-48_0-32",
+            "0/64-0_0-48_0-32",
+            "0/0-64_0-48",
+            "0/0-64_0-48_0-32_0-1",
+            "0/00-64_0-48_0-32",
+            "0/0-64_0-48_0-32/",
+            "99/0-64_0-48_0-32",
+            "0/4294967295-4294967295_0-48_0-32",
+            "zarr.json",
+        ];
+        for key in others {
+            assert!(entry(&volume(), key).is_err(), "{key}");
+        }
+    }
+
+    #[test]
+    fn levels_span_the_same_nanometres() {
+        let volume = volume();
+        let info = info(&volume);
+        let scales = info["scales"].as_array().unwrap();
+        assert_eq!(scales.len(), volume.levels.len());
+        for scale in scales {
+            for (axis, nm) in [4.0, 4.0, 40.0].into_iter().enumerate() {
+                let number = |name: &str| scale[name][axis].as_f64().unwrap();
+                let excess = number("size") * number("resolution") - volume.size_nm()[axis];
+                assert!((0.0..number("resolution")).contains(&excess), "{scale}");
+                assert_eq!(number("resolution") % nm, 0.0);
+            }
+        }
+    }
+}

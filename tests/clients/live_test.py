@@ -1,0 +1,144 @@
+"""Real clients against a live acquisition."""
+
+import json
+import os
+import unittest
+
+import numpy as np
+import ome_zarr_models
+import yaozarrs
+import zarr
+
+from lib.clients import all_tensorstores, everyone
+from lib.reference import Reference
+from lib.saccade import Acquisition
+
+POSITIONS = 60
+random = np.random.default_rng(5)
+
+
+class Live(unittest.TestCase):
+    """Tests run in the order of their names: the last one ends the acquisition."""
+
+    @classmethod
+    def setUpClass(cls):
+        cls.acquisition = Acquisition()
+        cls.addClassCleanup(cls.acquisition.close)
+        cls.reference = Reference(cls.acquisition)
+        cls.url = f"{cls.acquisition.url}/v/{Acquisition.NAME}"
+        cls.levels = len(cls.reference.extents)
+
+    def positions(self, level):
+        return random.integers(0, self.reference.extents[level], (POSITIONS, 3))
+
+    def compared(self, clients, level):
+        """Compares clients at positions that hold still meanwhile: returns those, and their values."""
+        for _ in range(30):
+            positions = self.positions(level)
+            before, values = self.reference.chunks(level, positions)
+            read = {name: client(level, positions) for name, client in clients.items()}
+            after, _ = self.reference.chunks(level, positions)
+            # Chunks whose state did not change in between had these values all the while.
+            still = before == after
+            for name, got in read.items():
+                np.testing.assert_array_equal(got[still], values[still], f"{name}, level {level}")
+            if still.mean() >= 0.3:
+                return positions[still], values[still]
+        self.fail(f"level {level} changes too fast to be compared")
+
+    def test_1_every_client_reads_the_same_voxels_while_they_arrive(self):
+        clients = everyone(self.url)
+        begun = self.acquisition.revision()
+        compared = measured = turned_differs = 0
+        while self.acquisition.revision() < begun + 8:
+            for level in range(self.levels):
+                positions, values = self.compared(clients, level)
+                compared += len(positions)
+                measured += (values != 0).sum()
+                turned = np.minimum(positions[:, ::-1], self.reference.extents[level] - 1)
+                turned_differs += (self.reference.values(level, turned) != values).sum()
+        self.assertTrue(self.acquisition.microscope.running(), "the acquisition ended before the comparison did")
+        self.assertGreater(measured, compared / 4, "most of what was compared was not acquired yet")
+        self.assertGreater(turned_differs, compared / 4, "the comparison cannot tell axes apart")
+        print(f"\n{compared} positions on {self.levels} levels, {measured} of them acquired, {len(clients)} clients")
+
+    def test_2_metadata_is_what_the_specifications_say(self):
+        yaozarrs.validate_zarr_store(f"{self.url}/zarr")
+        for version, folder, zarr_format in [("0.5", "zarr", 3), ("0.4", "zarr2", 2)]:
+            group = zarr.open_group(f"{self.url}/{folder}", mode="r", zarr_format=zarr_format)
+            image = ome_zarr_models.open_ome_zarr(group, version=version)
+            self.assertEqual(type(image).__name__, "Image")
+            self.assertEqual(image.ome_zarr_version, version)
+
+    def test_2_metadata_that_is_wrong_is_refused(self):
+        right = self.acquisition.get(f"v/{Acquisition.NAME}/zarr/zarr.json").decode()
+        image = json.loads(right)["attributes"]["ome"]["multiscales"][0]
+        yaozarrs.validate_ome_json(json.dumps({"version": "0.5", "multiscales": [image]}))
+        wrong = [
+            {**image, "axes": image["axes"][::-1]},
+            {**image, "datasets": [{"path": "0", "coordinateTransformations": []}]},
+        ]
+        for image in wrong:
+            with self.assertRaises(ValueError):
+                yaozarrs.validate_ome_json(json.dumps({"version": "0.5", "multiscales": [image]}))
+
+    def test_3_a_tile_that_moves_is_seen_without_opening_again(self):
+        self.acquisition.end()
+        rechecking = all_tensorstores(self.url, recheck_cached_data=True)
+        trusting = all_tensorstores(self.url, recheck_cached_data=False)
+        tile = next(record for record in self.acquisition.written() if record["record"] == "tile")
+        a, b, c, d, x, y = tile["transform"]
+        corner = np.array([round(x), round(y), tile["section"]])
+        size = np.array([*tile["size"], 1])
+        around = corner + np.clip(random.integers(0, size, (POSITIONS, 3)), 0, None)
+        around = np.clip(around, 0, self.reference.extents[0] - 1)
+        old = self.reference.values(0, around)
+        for name, client in {**rechecking, **trusting}.items():
+            np.testing.assert_array_equal(client(0, around), old, name)
+
+        moved = [a, b, c, d, x + 9, y + 7]
+        self.acquisition.append({"record": "transform", "tile": tile["tile"], "transform": moved})
+        new = self.reference.values(0, around)
+        self.assertGreater((new != old).sum(), POSITIONS / 2, "the tile did not move")
+        for name, client in rechecking.items():
+            np.testing.assert_array_equal(client(0, around), new, name)
+        for name, client in trusting.items():
+            self.assertTrue((client(0, around) == old).all(), f"{name} never cached: the comparison shows nothing")
+
+    @unittest.skipUnless(os.environ.get("SACCADE_CHROMIUM"), "no browser is named")
+    def test_4_neuroglancer_shows_the_voxels(self):
+        from lib.page import Page
+
+        section = self.acquisition.written()[0]["section"]
+        page = Page(os.environ["SACCADE_CHROMIUM"], self.reference.volume["voxel_nm"])
+        self.addCleanup(page.close)
+        shown = {}
+        for level in [0, 1]:
+            down = np.array(self.reference.volume["levels"][level]["downsampling"])
+            self.assertEqual(list(down), [[1, 1, 1], [2, 2, 1]][level])
+            width, height = size = [140, 96]
+            x, y = np.meshgrid(np.arange(width) + 3, np.arange(height) + 2)
+            at = np.stack([x, y, np.full_like(x, section)], -1).reshape(-1, 3)
+            want = self.reference.values(level, at).reshape(height, width)
+            self.assertGreater((want != 0).mean(), 0.3)
+            # The corner of the picture is a corner of voxels.
+            middle = np.array([3 + width / 2, 2 + height / 2, section + 0.5]) * down
+            for source, origin in [
+                (f"{self.url}/zarr/|zarr3:", 0.5),
+                (f"{self.url}/zarr2/|zarr2:", 0.5),
+                (f"{self.url}/precomputed/|neuroglancer-precomputed:", 0),
+            ]:
+                # In OME-Zarr the origin is the middle of voxel 0, in precomputed its corner. Pixels
+                # moved by less than half a voxel show the same voxels, if these are where they belong.
+                for moved in [0.3, -0.3]:
+                    at = middle - origin + np.array([moved, moved, 0]) * down
+                    got = page.section(source, list(at), size, down[0])
+                    np.testing.assert_array_equal(got, want, f"{source}, level {level}, moved by {moved}")
+            shown[level] = want
+        off = page.section(source, list(middle - origin + np.array([0.7, 0.7, 0]) * down), size, down[0])
+        self.assertGreater((off != want).mean(), 0.3, "the comparison cannot tell voxels from their neighbours")
+        self.assertGreater((shown[0] != shown[1]).mean(), 0.3, "the comparison cannot tell levels apart")
+
+
+if __name__ == "__main__":
+    unittest.main(verbosity=2)
