@@ -8,12 +8,14 @@ use saccade_core::transfer::{TABLE_LEN, TransferFunction};
 use saccade_core::volume::Volume;
 
 use crate::layout::{
-    FLAG_FALSE_COLORS, FLAG_JITTER, FLAG_SUBSTITUTE, FrameUniform, LevelUniform, TransferStorage,
+    DepthUniform, FLAG_FALSE_COLORS, FLAG_JITTER, FLAG_OCTREE, FLAG_RESIDENCY, FLAG_SUBSTITUTE,
+    FrameUniform, LevelUniform, MOST_DEPTHS, OctreeUniform, TransferStorage,
 };
 use crate::memory::plan::Plan;
+use crate::octree::ResidencyOctree;
 use crate::view::View;
 
-/// Anchors stay this near to the volume \[bricks\]; beyond, positions need no precision.
+/// Anchors stay this near to the volume \[bricks, cells\]; beyond, positions need no precision.
 const ANCHOR_REACH: f64 = 1e6;
 /// More levels than this finer or coarser make no sense.
 const MOST_BIAS: f32 = 32.0;
@@ -28,6 +30,7 @@ pub(crate) fn frame_uniform(
     volume: &Volume,
     tables: &PageTables,
     plan: &Plan,
+    octree: Option<&ResidencyOctree>,
 ) -> FrameUniform {
     let camera = &view.camera;
     let axes = camera.physical_from_eye_axes();
@@ -39,9 +42,10 @@ pub(crate) fn frame_uniform(
     let usable = axes.is_finite() && eye_nm.is_finite() && pixel.is_finite() && pixel > 0.0;
 
     let mut levels = [LevelUniform::zeroed(); MAX_LEVELS];
+    let bricks = f64::from(BRICK_EDGE);
     for ((uniform, level), table) in levels.iter_mut().zip(&volume.levels).zip(tables.levels()) {
         let voxel_nm = volume.voxel_nm * level.downsampling;
-        let (anchor, eye) = anchored(eye_nm / voxel_nm, table.bricks.as_dvec3());
+        let (anchor, eye) = anchored(eye_nm / voxel_nm, bricks, table.bricks.as_dvec3());
         *uniform = LevelUniform {
             eye,
             directory_base: table.directory_base,
@@ -52,7 +56,14 @@ pub(crate) fn frame_uniform(
             ..LevelUniform::zeroed()
         };
     }
+    if let Some(octree) = octree {
+        for (uniform, depths) in levels.iter_mut().zip(&octree.geometry().levels) {
+            uniform.values_depth = depths.values;
+        }
+    }
     let flag = |set, flag| if set { flag } else { 0 };
+    let values_hold = octree.is_some_and(ResidencyOctree::values_hold);
+    let residency = octree.is_some_and(ResidencyOctree::residency_is_complete);
     FrameUniform {
         forward: axes.z_axis.as_vec3(),
         pixel: single(pixel),
@@ -65,7 +76,9 @@ pub(crate) fn frame_uniform(
         down: (axes.y_axis * tangent).as_vec3(),
         flags: flag(view.substitute, FLAG_SUBSTITUTE)
             | flag(view.false_colors, FLAG_FALSE_COLORS)
-            | flag(view.jitter, FLAG_JITTER),
+            | flag(view.jitter, FLAG_JITTER)
+            | flag(values_hold, FLAG_OCTREE)
+            | flag(values_hold && residency, FLAG_RESIDENCY),
         low_nm: (-eye_nm).as_vec3(),
         depth: tables.shape().depth,
         high_nm: (volume.size_nm() - eye_nm).as_vec3(),
@@ -78,15 +91,42 @@ pub(crate) fn frame_uniform(
         usage_words: plan.usage_words(),
         pad_0: 0,
         levels,
+        octree: octree.map_or_else(OctreeUniform::zeroed, |octree| {
+            octree_uniform(octree, eye_nm, volume.voxel_nm)
+        }),
     }
 }
 
-/// A position \[voxels\] as a brick near it and the rest, which is small unless it is far outside.
-fn anchored(voxel: DVec3, bricks: DVec3) -> (IVec3, Vec3) {
-    let edge = f64::from(BRICK_EDGE);
+fn octree_uniform(octree: &ResidencyOctree, eye_nm: DVec3, voxel_nm: DVec3) -> OctreeUniform {
+    let geometry = octree.geometry();
+    let cell_nm = geometry.cell.as_dvec3() * voxel_nm;
+    let (anchor, eye) = anchored(eye_nm / cell_nm, 1.0, geometry.cells.as_dvec3());
+    let mut depths = [DepthUniform::zeroed(); MOST_DEPTHS];
+    for (depth, uniform) in (0..=geometry.deepest()).zip(&mut depths) {
+        *uniform = DepthUniform {
+            shift: geometry.depth(depth).shift,
+            residency: geometry.residency_at(depth),
+            bits: geometry.depth(depth).bits,
+            pad_0: 0,
+        };
+    }
+    OctreeUniform {
+        eye,
+        node_words: octree.node_words(),
+        anchor,
+        cells_per_nm: (1.0 / cell_nm).as_vec3(),
+        cells: geometry.cells,
+        depths,
+        ..OctreeUniform::zeroed()
+    }
+}
+
+/// A position as a box of a grid near it, with edges of `edge`, and the rest, which is small unless
+/// the position is far outside of the `count` boxes.
+fn anchored(position: DVec3, edge: f64, count: DVec3) -> (IVec3, Vec3) {
     let reach = DVec3::splat(ANCHOR_REACH);
-    let anchor = (voxel / edge).floor().max(-reach).min(bricks + reach);
-    (anchor.as_ivec3(), (voxel - anchor * edge).as_vec3())
+    let anchor = (position / edge).floor().max(-reach).min(count + reach);
+    (anchor.as_ivec3(), (position - anchor * edge).as_vec3())
 }
 
 /// The table that the shader reads: opacity as extinction, so that interpolation and step length
@@ -99,6 +139,7 @@ pub(crate) fn transfer_storage(transfer: &TransferFunction) -> TransferStorage {
         storage.colors[index] = [r, g, b, single(extinction.min(OPAQUE))];
         let opaque = u32::from(storage.colors[index][3] > 0.0);
         storage.opaque_before[index + 1] = storage.opaque_before[index] + opaque;
+        storage.visible_bins |= opaque << (index * 32 / TABLE_LEN);
     }
     debug_assert!(storage.opaque_before[TABLE_LEN] <= 256, "one per entry");
     storage
@@ -121,7 +162,7 @@ mod tests {
     fn positions_stay_exact_far_from_the_origin() {
         let bricks = DVec3::splat(62_500.0);
         let eye = DVec3::new(1_999_987.3, 1_234_567.91, 249_999.53);
-        let (anchor, rest) = anchored(eye, bricks);
+        let (anchor, rest) = anchored(eye, 32.0, bricks);
         let restored = anchor.as_dvec3() * 32.0 + rest.as_dvec3();
         assert!(
             (restored - eye).abs().max_element() < 1e-5,
@@ -161,7 +202,7 @@ mod tests {
 
     #[test]
     fn eyes_at_the_end_of_the_world_do_not_overflow() {
-        let (anchor, rest) = anchored(DVec3::new(1e15, -1e15, 3.0), DVec3::splat(4.0));
+        let (anchor, rest) = anchored(DVec3::new(1e15, -1e15, 3.0), 32.0, DVec3::splat(4.0));
         assert_eq!(anchor.z, 0);
         assert!(anchor.abs().max_element() < 2_000_000 && rest.is_finite());
     }

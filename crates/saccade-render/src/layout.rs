@@ -15,6 +15,11 @@ pub(crate) const FLAG_FALSE_COLORS: u32 = 2;
 /// Sample segments at a place that differs by pixel.
 pub(crate) const FLAG_JITTER: u32 = 4;
 
+/// Skip and substitute by the residency octree.
+pub(crate) const FLAG_OCTREE: u32 = 8;
+/// The octree notes every resident brick: levels it does not name are not there.
+pub(crate) const FLAG_RESIDENCY: u32 = 16;
+
 /// Words at the front of a report.
 pub(crate) const COUNTERS: u32 = 16;
 /// Distinct entries missed, also those the list had no room for.
@@ -32,6 +37,28 @@ pub(crate) const MOST_SUBSTITUTED_LEVELS: u32 = 5;
 /// [`MAX_LEVELS`] less the finest level wanted; 0 where no ray met the volume.
 pub(crate) const FINEST_LEVEL: u32 = 6;
 
+/// Nodes of the residency octree visited.
+pub(crate) const COUNT_NODES: u32 = 7;
+
+/// Depths that a residency octree can have, its root's included.
+pub(crate) const MOST_DEPTHS: usize = 24;
+/// Children of a node of the residency octree, kept side by side.
+pub(crate) const SIBLINGS: u32 = 8;
+/// Word of a node: block of its children, 0 where it has none.
+pub(crate) const NODE_CHILDREN: u32 = 0;
+/// First word of a node's first channel; the others follow.
+pub(crate) const NODE_CHANNEL: u32 = 1;
+/// Words of a channel.
+pub(crate) const NODE_CHANNEL_WORDS: u32 = 4;
+/// Word of a channel: a bit per eight stored values that samples may have.
+pub(crate) const NODE_BINS: u32 = 0;
+/// Word of a channel: smallest and largest stored value, 16 bits each.
+pub(crate) const NODE_RANGE: u32 = 1;
+/// Word of a channel: levels for whose samples bins and range hold, as bits.
+pub(crate) const NODE_VALID: u32 = 2;
+/// Word of a channel: levels with a resident brick that overlaps the node, as bits.
+pub(crate) const NODE_RESIDENT: u32 = 3;
+
 /// Misses a report has room for. Others are reported by a later frame.
 pub(crate) const MISSES: u32 = 4096;
 
@@ -44,11 +71,36 @@ pub(crate) struct LevelUniform {
     pub(crate) anchor: IVec3,
     pub(crate) pad_0: u32,
     pub(crate) voxels_per_nm: Vec3,
-    pub(crate) pad_1: u32,
+    pub(crate) values_depth: u32,
     pub(crate) bricks: UVec3,
     pub(crate) pad_2: u32,
     pub(crate) directory: UVec3,
     pub(crate) pad_3: u32,
+}
+
+/// Nodes of one depth of the residency octree.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct DepthUniform {
+    pub(crate) shift: UVec3,
+    pub(crate) residency: u32,
+    pub(crate) bits: UVec3,
+    pub(crate) pad_0: u32,
+}
+
+/// The residency octree as seen from the eye. Fields are explained in `lib/frame.wgsl`.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct OctreeUniform {
+    pub(crate) eye: Vec3,
+    pub(crate) node_words: u32,
+    pub(crate) anchor: IVec3,
+    pub(crate) pad_0: u32,
+    pub(crate) cells_per_nm: Vec3,
+    pub(crate) pad_1: u32,
+    pub(crate) cells: UVec3,
+    pub(crate) pad_2: u32,
+    pub(crate) depths: [DepthUniform; MOST_DEPTHS],
 }
 
 /// One frame. Fields are explained in `lib/frame.wgsl`.
@@ -73,6 +125,7 @@ pub(crate) struct FrameUniform {
     pub(crate) usage_words: u32,
     pub(crate) pad_0: u32,
     pub(crate) levels: [LevelUniform; MAX_LEVELS],
+    pub(crate) octree: OctreeUniform,
 }
 
 /// Colours by stored value.
@@ -83,7 +136,9 @@ pub(crate) struct TransferStorage {
     pub(crate) colors: [[f32; 4]; TABLE_LEN],
     /// Entries below an index that are not transparent.
     pub(crate) opaque_before: [u32; TABLE_LEN + 1],
-    pub(crate) pad_0: [u32; 3],
+    /// A bit per eight entries: whether any is not transparent.
+    pub(crate) visible_bins: u32,
+    pub(crate) pad_0: [u32; 2],
 }
 
 /// The ray-caster's source: shared files first, the entry point last.
@@ -93,6 +148,7 @@ pub(crate) const RAY_CAST: &str = concat!(
     include_str!("shaders/lib/ray.wgsl"),
     include_str!("shaders/lib/color.wgsl"),
     include_str!("shaders/memory.wgsl"),
+    include_str!("shaders/octree.wgsl"),
     include_str!("shaders/ray_cast.wgsl"),
 );
 
@@ -181,6 +237,18 @@ mod tests {
             ("FLAG_SUBSTITUTE", FLAG_SUBSTITUTE),
             ("FLAG_FALSE_COLORS", FLAG_FALSE_COLORS),
             ("FLAG_JITTER", FLAG_JITTER),
+            ("FLAG_OCTREE", FLAG_OCTREE),
+            ("FLAG_RESIDENCY", FLAG_RESIDENCY),
+            ("MOST_DEPTHS", u32::try_from(MOST_DEPTHS).unwrap()),
+            ("SIBLINGS", SIBLINGS),
+            ("NODE_CHILDREN", NODE_CHILDREN),
+            ("NODE_CHANNEL", NODE_CHANNEL),
+            ("NODE_CHANNEL_WORDS", NODE_CHANNEL_WORDS),
+            ("NODE_BINS", NODE_BINS),
+            ("NODE_RANGE", NODE_RANGE),
+            ("NODE_VALID", NODE_VALID),
+            ("NODE_RESIDENT", NODE_RESIDENT),
+            ("COUNT_NODES", COUNT_NODES),
             ("COUNTERS", COUNTERS),
             ("COUNT_MISSES", COUNT_MISSES),
             ("COUNT_STALE", COUNT_STALE),
@@ -234,6 +302,7 @@ mod tests {
             directory_base,
             anchor,
             voxels_per_nm,
+            values_depth,
             bricks,
             directory
         );
@@ -256,10 +325,23 @@ mod tests {
             first_row,
             size,
             usage_words,
-            levels
+            levels,
+            octree
         );
         assert_eq!(wgsl_struct(&module, "Frame"), frame);
-        let transfer = rust_struct!(TransferStorage, colors, opaque_before);
+        let depth = rust_struct!(DepthUniform, shift, residency, bits);
+        assert_eq!(wgsl_struct(&module, "Depth"), depth);
+        let octree = rust_struct!(
+            OctreeUniform,
+            eye,
+            node_words,
+            anchor,
+            cells_per_nm,
+            cells,
+            depths
+        );
+        assert_eq!(wgsl_struct(&module, "Octree"), octree);
+        let transfer = rust_struct!(TransferStorage, colors, opaque_before, visible_bins);
         assert_eq!(wgsl_struct(&module, "Transfer"), transfer);
     }
 }

@@ -14,14 +14,17 @@
 //!                       └ used slot, a bit                  misses, fidelity  last frame used)
 //! ```
 //!
-//! 1. [`Renderer::render`] uploads what changed in the page tables, casts one ray per pixel, and
-//!    asks for the report. It returns at once.
-//! 2. A ray walks from the page directory through page table blocks to a brick \[000 §4.1.3\]. An
+//! 1. [`Renderer::render`] uploads what changed in the page tables and the residency octree, casts one
+//!    ray per pixel, and asks for the report. It returns at once.
+//! 2. A ray asks the octree, from the node it was in last, for the largest region around its next
+//!    sample that the transfer function hides or in which all samples are alike \[001 §7.1\], and
+//!    passes it in one step. Such a region needs no brick.
+//! 3. Elsewhere it walks from the page directory through page table blocks to a brick \[000 §4.1.3\]. An
 //!    unmapped entry is marked by its *physical* number in a dense bitmask and listed once, at most
 //!    four per ray, front to back \[000 §4.2.2\].
-//! 3. [`Renderer::poll`] reads reports that have arrived. Missing page table blocks are made at
+//! 4. [`Renderer::poll`] reads reports that have arrived. Missing page table blocks are made at
 //!    once, so the bricks behind them show up in the next report ([`FrameReport::redraw`]).
-//! 4. [`Renderer::deliver`] gives a brick the slot that was used longest ago.
+//! 5. [`Renderer::deliver`] gives a brick the slot that was used longest ago.
 //!
 //! When the bricks of a view do not fit, the level of detail becomes coarser until they do, the
 //! report says so ([`FrameReport::memory_bias`]), and it becomes finer again when it can.
@@ -54,7 +57,9 @@
 //! - What is **missing** is drawn from the nearest coarser level that is there, else from up to two
 //!   levels finer, else not at all. Where no good substitute is there, a brick two levels coarser
 //!   and the coarsest one are asked for first: they come soon and show much.
-//! - Bricks that are empty, and those the transfer function hides entirely, cost one lookup.
+//! - Regions that are **hidden** by the transfer function are never sampled, and their bricks neither
+//!   asked for nor kept, once it is known what values they have: from an earlier brick of the same
+//!   level, or from [`Renderer::note_range`]. What is known outlives the brick, not a change.
 //!
 //! # Failure
 //!
@@ -74,6 +79,7 @@ mod gpu;
 mod image;
 mod layout;
 mod memory;
+mod octree;
 mod options;
 mod ray_caster;
 mod readback;
@@ -86,7 +92,7 @@ mod view;
 pub use delivery::{BrickVoxels, Delivery, DeliveryError};
 pub use gpu::{Gpu, GpuError};
 pub use image::{Image, ReadError};
-pub use options::{RendererError, RendererOptions};
+pub use options::{RendererError, RendererOptions, Traversal};
 pub use renderer::Renderer;
 pub use report::{Fidelity, FrameReport, MemoryUse, Statistics};
 pub use view::View;

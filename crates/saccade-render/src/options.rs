@@ -1,7 +1,18 @@
 //! What a renderer may use, and why there may be none.
 
+use glam::UVec3;
 use saccade_core::page_table::{PageTableError, PageTableShape};
 use saccade_core::volume::Dtype;
+
+/// How rays find what is not worth sampling, and what may stand in for what is missing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Traversal {
+    /// By the residency octree.
+    #[default]
+    ResidencyOctree,
+    /// By page tables alone, brick by brick: slower, and the same picture. For comparison.
+    PageTables,
+}
 
 /// What a renderer may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -11,6 +22,11 @@ pub struct RendererOptions {
     pub memory_bytes: u64,
     /// How page tables are cut; `None` chooses by the volume's size.
     pub page_table_shape: Option<PageTableShape>,
+    /// How rays find their way.
+    pub traversal: Traversal,
+    /// Size of the residency octree's smallest boxes \[level-0 voxels\], rounded to powers of
+    /// two; `None` chooses by the shape of voxels. At coarser levels boxes are as many voxels *of that level*.
+    pub octree_cell: Option<UVec3>,
     /// Submissions a frame is cut into. More than one keeps slow drivers from giving up on a
     /// frame that takes seconds, and lets windows breathe between.
     pub bands: u32,
@@ -21,6 +37,8 @@ impl Default for RendererOptions {
         Self {
             memory_bytes: 512 << 20,
             page_table_shape: None,
+            traversal: Traversal::default(),
+            octree_cell: None,
             bands: 1,
         }
     }

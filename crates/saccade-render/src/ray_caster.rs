@@ -51,6 +51,7 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
             format: IMAGE_FORMAT,
             view_dimension: wgpu::TextureViewDimension::D2,
         },
+        storage(true),
     ];
     let entries = (0..)
         .zip(types)

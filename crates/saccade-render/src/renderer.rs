@@ -6,7 +6,7 @@ use std::sync::Arc;
 use glam::UVec2;
 use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
 use saccade_core::page_table::{PageTableShape, PageTables};
-use saccade_core::transfer::TransferFunction;
+use saccade_core::transfer::{TABLE_LEN, TransferFunction};
 use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
@@ -14,10 +14,12 @@ use crate::delivery::{BrickVoxels, Delivery, DeliveryError};
 use crate::frame::{frame_uniform, transfer_storage};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
-use crate::memory::plan::{DeviceLimits, Misfit, Plan, READBACKS};
+use crate::layout::{NODE_CHANNEL, NODE_CHANNEL_WORDS};
+use crate::memory::plan::{DeviceLimits, Misfit, OctreeSize, Plan, READBACKS};
 use crate::memory::pressure::Pressure;
 use crate::memory::{Frame, Placement, VirtualMemory, Want};
-use crate::options::{RendererError, RendererOptions};
+use crate::octree::{BrickValues, Geometry, ResidencyOctree, Values, default_cell};
+use crate::options::{RendererError, RendererOptions, Traversal};
 use crate::readback::{self, Staging};
 use crate::report::{FrameReport, MemoryUse, RawReport};
 use crate::resources::{Picture, Resources};
@@ -27,9 +29,13 @@ use crate::view::View;
 /// Channels drawn: the first.
 const CHANNELS: u32 = 1;
 /// Storage buffers the ray-caster binds.
-const STORAGE_BUFFERS: u64 = 6;
+const STORAGE_BUFFERS: u64 = 7;
 /// Page table blocks made for one report; the others come with the next.
 const TABLES_PER_FRAME: u32 = 64;
+
+/// Nodes of the octree visited before a frame, to bring it up to date. What is left waits for the
+/// next frame.
+const NODES_PER_FRAME: u64 = 32_768;
 
 /// Draws one volume. See the crate's documentation for the way of a frame.
 #[derive(Debug)]
@@ -39,8 +45,11 @@ pub struct Renderer {
     options: RendererOptions,
     plan: Plan,
     memory: VirtualMemory,
+    octree: Option<ResidencyOctree>,
     pressure: Pressure,
     polarity: Polarity,
+    /// Of the transfer function: entries below an index that are not transparent.
+    opaque_before: [u32; TABLE_LEN + 1],
     resources: Resources,
     picture: Picture,
     readbacks: Vec<Readback>,
@@ -98,14 +107,23 @@ impl Renderer {
                 .min(limits.max_storage_buffer_binding_size),
         };
         let ceiling = options.memory_bytes;
-        let plan = Plan::new(&tables, ceiling, device).map_err(|misfit| match misfit {
-            Misfit::Ceiling(needed) => RendererError::Ceiling { ceiling, needed },
-            Misfit::Buffer(needed) => RendererError::Limit {
-                what: "bytes in a storage buffer",
-                offered: device.buffer,
-                needed,
-            },
-        })?;
+        let octree = (options.traversal == Traversal::ResidencyOctree).then(|| {
+            let cell = options.octree_cell;
+            Geometry::new(&volume, cell.unwrap_or_else(|| default_cell(&volume)))
+        });
+        let octree_size = OctreeSize {
+            blocks: octree.as_ref().map_or(0, Geometry::all_blocks),
+            node_words: NODE_CHANNEL + CHANNELS * NODE_CHANNEL_WORDS,
+        };
+        let plan =
+            Plan::new(&tables, octree_size, ceiling, device).map_err(|misfit| match misfit {
+                Misfit::Ceiling(needed) => RendererError::Ceiling { ceiling, needed },
+                Misfit::Buffer(needed) => RendererError::Limit {
+                    what: "bytes in a storage buffer",
+                    offered: device.buffer,
+                    needed,
+                },
+            })?;
         let bands = options.bands.max(1);
         let resources = Resources::new(gpu, &plan, bands);
         let readback = |_| Readback {
@@ -119,8 +137,11 @@ impl Renderer {
             volume,
             options: RendererOptions { bands, ..options },
             memory: VirtualMemory::new(tables, plan.blocks, plan.bricks()),
+            octree: octree
+                .map(|geometry| ResidencyOctree::new(geometry, CHANNELS, plan.node_blocks)),
             pressure: Pressure::default(),
             polarity: Polarity::default(),
+            opaque_before: [0; TABLE_LEN + 1],
             picture: resources.picture(gpu, UVec2::ONE),
             resources,
             readbacks: (0..READBACKS).map(readback).collect(),
@@ -147,9 +168,14 @@ impl Renderer {
         if transfer.polarity != self.polarity {
             self.polarity = transfer.polarity;
             self.memory.drop_bricks();
+            self.memory.take_evicted();
+            if let Some(octree) = &mut self.octree {
+                octree.clear();
+            }
         }
-        self.resources
-            .write_transfer(&self.gpu, &transfer_storage(transfer));
+        let storage = transfer_storage(transfer);
+        self.resources.write_transfer(&self.gpu, &storage);
+        self.opaque_before = storage.opaque_before;
         self.pressure.view_changed();
     }
 
@@ -174,8 +200,13 @@ impl Renderer {
         self.memory.flush(|array, first, entries| {
             resources.write_entries(gpu, array, first, entries);
         });
+        if let Some(octree) = &mut self.octree {
+            octree.advance(NODES_PER_FRAME);
+            octree.flush(|first, words| resources.write_nodes(gpu, first, words));
+        }
         let tables = self.memory.tables();
-        let uniform = frame_uniform(&view, lod_bias, &self.volume, tables, &self.plan);
+        let octree = self.octree.as_ref();
+        let uniform = frame_uniform(&view, lod_bias, &self.volume, tables, &self.plan, octree);
         let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());
         let target = readback.as_ref().map(|r| r.staging.buffer());
         resources.draw(gpu, &self.picture, &uniform, self.options.bands, target);
@@ -260,6 +291,7 @@ impl Renderer {
             Some(brick) if brick.range[1] > 0 => self.memory.place(id),
             _ => self.memory.place_empty(id),
         };
+        self.note(id, placement, stored.as_ref());
         Ok(match (placement, stored) {
             (Placement::Slot(slot), Some(brick)) => {
                 self.resources
@@ -276,11 +308,52 @@ impl Renderer {
         })
     }
 
+    /// Tells the octree of a delivered brick and of what it displaced.
+    fn note(&mut self, id: BrickId, placement: Placement, stored: Option<&StoredBrick<'_>>) {
+        let Some(octree) = &mut self.octree else {
+            self.memory.take_evicted();
+            return;
+        };
+        for evicted in self.memory.take_evicted() {
+            octree.remove(evicted);
+        }
+        let values = stored.map_or(BrickValues::uniform(Values::ZERO), |brick| {
+            octree.values_of(id, &brick.voxels)
+        });
+        match placement {
+            Placement::Slot(_) => octree.insert(id, values),
+            // What is known of a brick outlives it, even one that found no room.
+            Placement::Empty | Placement::NoRoom => octree.note(id, values),
+        }
+    }
+
+    /// Notes that measured voxels of a brick and its border are `min` to `max`, which a source may
+    /// know before the brick is built. Some of its voxels may not have been acquired.
+    ///
+    /// Returns whether the transfer function hides all of that: as a rule, frames from the next one
+    /// on do without the brick. One that asks for it again needs it, since what is known of
+    /// different levels mixes. Always `false` without a residency octree.
+    pub fn note_range(&mut self, id: BrickId, [min, max]: [u8; 2]) -> bool {
+        let Some(octree) = self.octree.as_mut().filter(|_| self.memory.contains(id)) else {
+            return false;
+        };
+        // Not acquired is stored as 0, and interpolation reaches everything from there on.
+        let largest = match self.polarity {
+            Polarity::Bright => max,
+            Polarity::Dark => self.polarity.stored(min.max(1)),
+        };
+        octree.note(id, BrickValues::uniform(Values::between(0, largest)));
+        self.opaque_before[usize::from(largest) + 1] == self.opaque_before[0]
+    }
+
     /// Level-0 voxels changed: their bricks are wanted again at all levels.
     ///
     /// Resident ones stay in the picture until their replacement is delivered, and count as missing.
     pub fn invalidate(&mut self, voxels: VoxelBox) {
         self.memory.invalidate(&self.volume.levels, voxels);
+        if let Some(octree) = &mut self.octree {
+            octree.invalidate(voxels);
+        }
     }
 
     /// The picture: `Rgba8Unorm` holding sRGB-encoded values, opaque. Replaced when the size of the
@@ -318,6 +391,7 @@ impl Renderer {
         MemoryUse {
             bricks: self.plan.brick_bytes(),
             tables: self.plan.table_bytes(),
+            octree: self.plan.octree_bytes(),
             readback: self.plan.readback_bytes(),
             image: u64::from(x) * u64::from(y) * 4,
             ceiling: self.options.memory_bytes,
@@ -325,6 +399,8 @@ impl Renderer {
             bricks_resident,
             table_slots,
             tables_resident,
+            node_blocks: self.plan.node_blocks,
+            node_blocks_used: self.octree.as_ref().map_or(0, |o| o.blocks().0),
         }
     }
 

@@ -3,8 +3,8 @@
 use saccade_core::brick::{BrickId, MAX_LEVELS};
 
 use crate::layout::{
-    COUNT_LOOKUPS, COUNT_MISSES, COUNT_SAMPLES, COUNT_STALE, COUNT_SUBSTITUTED, COUNTERS,
-    FINEST_LEVEL, MISSES, MOST_SUBSTITUTED_LEVELS,
+    COUNT_LOOKUPS, COUNT_MISSES, COUNT_NODES, COUNT_SAMPLES, COUNT_STALE, COUNT_SUBSTITUTED,
+    COUNTERS, FINEST_LEVEL, MISSES, MOST_SUBSTITUTED_LEVELS,
 };
 
 /// What a frame was. Arrives some frames later; not every frame has one.
@@ -58,6 +58,8 @@ pub struct Statistics {
     pub samples: u32,
     /// Page table walks.
     pub lookups: u32,
+    /// Nodes of the residency octree visited.
+    pub nodes: u32,
     /// Ray segments drawn from another level than wanted.
     pub substituted: u32,
     /// Bricks in use.
@@ -73,6 +75,8 @@ pub struct MemoryUse {
     pub bricks: u64,
     /// The page directory, the page table cache and what marks their entries.
     pub tables: u64,
+    /// The residency octree.
+    pub octree: u64,
     /// Buffers for reading back.
     pub readback: u64,
     /// The picture.
@@ -87,12 +91,16 @@ pub struct MemoryUse {
     pub table_slots: u32,
     /// Of those, filled.
     pub tables_resident: u32,
+    /// Places for blocks of eight octree nodes.
+    pub node_blocks: u32,
+    /// Of those, filled.
+    pub node_blocks_used: u32,
 }
 
 impl MemoryUse {
     /// What counts against the ceiling.
     pub fn total(&self) -> u64 {
-        self.bricks + self.tables + self.readback
+        self.bricks + self.tables + self.octree + self.readback
     }
 }
 
@@ -148,6 +156,7 @@ impl<'a> RawReport<'a> {
         Statistics {
             samples: self.counter(COUNT_SAMPLES),
             lookups: self.counter(COUNT_LOOKUPS),
+            nodes: self.counter(COUNT_NODES),
             substituted: self.counter(COUNT_SUBSTITUTED),
             bricks_used,
             blocks_used,

@@ -16,6 +16,7 @@ pub(crate) struct Resources {
     frame_stride: u32,
     directory: wgpu::Buffer,
     tables: wgpu::Buffer,
+    nodes: wgpu::Buffer,
     slot_ranges: wgpu::Buffer,
     missed: wgpu::Buffer,
     report: wgpu::Buffer,
@@ -50,6 +51,7 @@ impl Resources {
         );
         let directory = words("page directory", plan.directory, storage | copy_dst);
         let tables = words("page table cache", plan.table_entries(), storage | copy_dst);
+        let nodes = buffer(device, "octree", plan.octree_bytes(), storage | copy_dst);
         let slot_ranges = words("slot ranges", plan.bricks(), storage | copy_dst);
         let missed = words("missed", plan.mask_words(), storage | copy_dst);
         let report_usage = storage | copy_dst | wgpu::BufferUsages::COPY_SRC;
@@ -82,6 +84,7 @@ impl Resources {
             frame_stride,
             directory,
             tables,
+            nodes,
             slot_ranges,
             missed,
             report,
@@ -115,6 +118,7 @@ impl Resources {
             wgpu::BindingResource::TextureView(&bricks),
             wgpu::BindingResource::Sampler(&self.sampler),
             wgpu::BindingResource::TextureView(&view),
+            self.nodes.as_entire_binding(),
         ];
         let entries = (0..).zip(resources);
         let entries = entries.map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource });
@@ -142,6 +146,14 @@ impl Resources {
         };
         gpu.queue()
             .write_buffer(buffer, u64::from(first) * 4, bytemuck::cast_slice(entries));
+    }
+
+    pub(crate) fn write_nodes(&self, gpu: &Gpu, first: u32, words: &[u32]) {
+        gpu.queue().write_buffer(
+            &self.nodes,
+            u64::from(first) * 4,
+            bytemuck::cast_slice(words),
+        );
     }
 
     /// Writes a brick with its border, and the range of its values.

@@ -84,6 +84,8 @@ pub(crate) struct VirtualMemory {
     blocks: Slots<Block>,
     bricks: Slots<Brick>,
     dirty: Dirty,
+    /// Bricks that lost their slot since the last [`Self::take_evicted`].
+    evicted: Vec<BrickId>,
     /// The frame that will be drawn next.
     next: Frame,
     /// The latest frame whose use of slots is known; slots it used stay.
@@ -100,6 +102,7 @@ impl VirtualMemory {
             blocks: Slots::new(blocks),
             bricks: Slots::new(bricks),
             dirty: Dirty::new(blocks),
+            evicted: Vec::new(),
             next: 1,
             reported: 0,
             tables,
@@ -192,6 +195,11 @@ impl VirtualMemory {
         }
     }
 
+    /// Bricks that lost their slot since the last call, in order.
+    pub(crate) fn take_evicted(&mut self) -> std::vec::Drain<'_, BrickId> {
+        self.evicted.drain(..)
+    }
+
     /// Whether the volume has such a brick.
     pub(crate) fn contains(&self, id: BrickId) -> bool {
         let level = self.tables.levels().get(id.level() as usize);
@@ -225,7 +233,7 @@ impl VirtualMemory {
             return Placement::NoRoom;
         };
         if let Some(slot) = self.get(entry).slot() {
-            self.bricks.remove(slot);
+            self.remove_brick(slot);
         }
         self.set(entry, Entry::EMPTY);
         self.fold(entry);
@@ -250,9 +258,7 @@ impl VirtualMemory {
     /// Drops every brick. What is known to be empty stays so.
     pub(crate) fn drop_bricks(&mut self) {
         for slot in 0..self.bricks.capacity() {
-            if let Some(brick) = self.bricks.remove(slot) {
-                self.set(brick.entry, Entry::UNMAPPED);
-            }
+            self.evict_brick(slot);
         }
     }
 
@@ -291,9 +297,15 @@ impl VirtualMemory {
     }
 
     fn evict_brick(&mut self, slot: u32) {
-        if let Some(brick) = self.bricks.remove(slot) {
+        if let Some(brick) = self.remove_brick(slot) {
             self.set(brick.entry, Entry::UNMAPPED);
         }
+    }
+
+    fn remove_brick(&mut self, slot: u32) -> Option<Brick> {
+        let brick = self.bricks.remove(slot)?;
+        self.evicted.push(brick.id);
+        Some(brick)
     }
 
     /// Puts a block of unknown entries, or of empty ones where that was known, under an entry.
@@ -345,7 +357,7 @@ impl VirtualMemory {
                 continue;
             };
             if leaf {
-                self.bricks.remove(below);
+                self.remove_brick(below);
             } else {
                 self.evict_block(below);
             }

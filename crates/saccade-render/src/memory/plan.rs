@@ -4,7 +4,7 @@ use glam::UVec3;
 use saccade_core::brick::{BRICK_STORED_EDGE, BRICK_STORED_VOXELS};
 use saccade_core::page_table::PageTables;
 
-use crate::layout::{COUNTERS, MISSES};
+use crate::layout::{COUNTERS, MISSES, SIBLINGS};
 
 /// Readbacks in flight at once; each has a buffer of its own.
 pub(crate) const READBACKS: u64 = 3;
@@ -14,6 +14,20 @@ const LEAST_BRICKS: u64 = 64;
 const LEAST_BLOCKS: u64 = 8;
 /// The share of the ceiling that page table blocks may take.
 const TABLE_SHARE: u64 = 16;
+
+/// The share of the ceiling that the residency octree may take.
+const OCTREE_SHARE: u64 = 16;
+/// Blocks of nodes that every octree gets, if it has so many.
+const LEAST_NODE_BLOCKS: u64 = 64;
+
+/// What a residency octree has use for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OctreeSize {
+    /// Blocks of eight nodes, grown everywhere.
+    pub(crate) blocks: u64,
+    /// Words of a node.
+    pub(crate) node_words: u32,
+}
 
 /// What the device allows.
 #[derive(Clone, Copy, Debug)]
@@ -33,6 +47,9 @@ pub(crate) struct Plan {
     pub(crate) brick_grid: UVec3,
     /// Entries of the page directory.
     pub(crate) directory: u32,
+    /// Blocks of eight nodes of the residency octree.
+    pub(crate) node_blocks: u32,
+    node_words: u32,
     block_entries: u32,
 }
 
@@ -49,6 +66,7 @@ impl Plan {
     /// Fills the ceiling, or less where the volume has no use for more.
     pub(crate) fn new(
         tables: &PageTables,
+        octree: OctreeSize,
         ceiling: u64,
         limits: DeviceLimits,
     ) -> Result<Self, Misfit> {
@@ -63,18 +81,30 @@ impl Plan {
             .max(LEAST_BLOCKS)
             .min(most_blocks)
             .clamp(1, 1 << 16);
-        let plan = |blocks: u64, brick_grid| Self {
+        let node_block_bytes = u64::from(octree.node_words * SIBLINGS) * 4;
+        let most_node_blocks = octree.blocks.min(limits.buffer / node_block_bytes).max(2);
+        let node_blocks = (ceiling / OCTREE_SHARE / node_block_bytes)
+            .max(LEAST_NODE_BLOCKS)
+            .min(most_node_blocks)
+            .min(1 << 28);
+        let plan = |blocks: u64, node_blocks: u64, brick_grid| Self {
             blocks: u32::try_from(blocks).expect("at most 2^16"),
             brick_grid,
             directory,
+            node_blocks: u32::try_from(node_blocks).expect("at most 2^28"),
+            node_words: octree.node_words,
             block_entries,
         };
         let most_bricks = bricks_of(tables);
-        let tables_only = plan(blocks, UVec3::ZERO);
+        let tables_only = plan(blocks, node_blocks, UVec3::ZERO);
         let per_brick = BRICK_STORED_VOXELS as u64 + 4 + 1;
         let room = ceiling.saturating_sub(tables_only.total_bytes()) / per_brick;
         if room < LEAST_BRICKS.min(most_bricks) {
-            let smallest = plan(LEAST_BLOCKS.min(most_blocks).max(1), UVec3::ZERO);
+            let smallest = plan(
+                LEAST_BLOCKS.min(most_blocks).max(1),
+                LEAST_NODE_BLOCKS.min(most_node_blocks),
+                UVec3::ZERO,
+            );
             let needed = smallest.total_bytes() + LEAST_BRICKS.min(most_bricks) * per_brick;
             return Err(Misfit::Ceiling(needed.max(ceiling + 1)));
         }
@@ -83,6 +113,7 @@ impl Plan {
         let fits = product(whole) >= most_bricks && product(whole) <= room;
         Ok(plan(
             blocks,
+            node_blocks,
             if fits {
                 whole
             } else {
@@ -132,8 +163,13 @@ impl Plan {
         self.report_bytes() * (1 + READBACKS)
     }
 
+    /// The residency octree \[bytes\].
+    pub(crate) fn octree_bytes(&self) -> u64 {
+        u64::from(self.node_blocks) * u64::from(self.node_words * SIBLINGS) * 4
+    }
+
     fn total_bytes(&self) -> u64 {
-        self.brick_bytes() + self.table_bytes() + self.readback_bytes()
+        self.brick_bytes() + self.table_bytes() + self.octree_bytes() + self.readback_bytes()
     }
 }
 
@@ -197,6 +233,10 @@ mod tests {
     use saccade_core::levels::halving_levels;
     use saccade_core::page_table::PageTableShape;
 
+    const OCTREE: OctreeSize = OctreeSize {
+        blocks: 1 << 40,
+        node_words: 5,
+    };
     const LIMITS: DeviceLimits = DeviceLimits {
         texture_edge: 2048,
         buffer: 128 << 20,
@@ -212,7 +252,7 @@ mod tests {
         let extents = [[32_768, 32_768, 4_096], [2_000_000, 2_000_000, 250_000]];
         for extent in extents.map(UVec3::from_array) {
             for ceiling in [64 << 20, 256 << 20, 3_000_000_019] {
-                let plan = Plan::new(&tables(extent), ceiling, LIMITS).unwrap();
+                let plan = Plan::new(&tables(extent), OCTREE, ceiling, LIMITS).unwrap();
                 let total = plan.total_bytes();
                 assert!(
                     total <= ceiling,
@@ -229,7 +269,13 @@ mod tests {
 
     #[test]
     fn small_volumes_take_what_they_need() {
-        let plan = Plan::new(&tables(UVec3::new(61, 47, 33)), 1 << 30, LIMITS).unwrap();
+        let octree = OctreeSize {
+            blocks: 99,
+            ..OCTREE
+        };
+        let tables = tables(UVec3::new(61, 47, 33));
+        let plan = Plan::new(&tables, octree, 1 << 30, LIMITS).unwrap();
+        assert_eq!(plan.node_blocks, 99);
         assert!(plan.total_bytes() < 4 << 20, "{plan:?}");
         let all = 2 * 2 * 2 + 1;
         assert!(plan.bricks() >= all, "every brick has a slot");
@@ -238,16 +284,16 @@ mod tests {
     #[test]
     fn too_low_a_ceiling_names_one_that_does() {
         let tables = tables(UVec3::new(32_768, 32_768, 4_096));
-        let Err(Misfit::Ceiling(needed)) = Plan::new(&tables, 100_000, LIMITS) else {
+        let Err(Misfit::Ceiling(needed)) = Plan::new(&tables, OCTREE, 100_000, LIMITS) else {
             panic!("100 kB cannot hold a picture's bricks");
         };
-        assert!(Plan::new(&tables, needed + needed / 8, LIMITS).is_ok());
+        assert!(Plan::new(&tables, OCTREE, needed + needed / 8, LIMITS).is_ok());
         let small = DeviceLimits {
             buffer: 1000,
             ..LIMITS
         };
         assert!(matches!(
-            Plan::new(&tables, 1 << 30, small),
+            Plan::new(&tables, OCTREE, 1 << 30, small),
             Err(Misfit::Buffer(_))
         ));
     }

@@ -33,6 +33,8 @@ struct World {
     levels: Vec<Level>,
     ids: Vec<BrickId>,
     said: BTreeMap<BrickId, Said>,
+    /// Bricks with a slot, as far as one was told.
+    resident: BTreeSet<BrickId>,
     /// Content per brick slot, as the texture has it.
     texture: HashMap<u32, u32>,
     /// The arrays as the device has them.
@@ -66,6 +68,7 @@ impl World {
             levels,
             ids,
             said: BTreeMap::new(),
+            resident: BTreeSet::new(),
             texture: HashMap::new(),
             device,
             in_use: BTreeMap::new(),
@@ -87,6 +90,8 @@ impl World {
                     Placement::Slot(slot) => {
                         self.next_content += 1;
                         self.texture.insert(slot, self.next_content);
+                        self.take_evicted();
+                        self.resident.insert(id);
                         let content = Some(self.next_content);
                         self.said.insert(
                             id,
@@ -137,6 +142,12 @@ impl World {
         }
     }
 
+    fn take_evicted(&mut self) {
+        for id in self.memory.take_evicted() {
+            assert!(self.resident.remove(&id), "{id} had no slot to lose");
+        }
+    }
+
     fn report(&mut self, number: u32) {
         let frame = self.memory.next_frame();
         self.memory.frame_submitted();
@@ -181,6 +192,9 @@ impl World {
 
     /// Everything that must hold at any time.
     fn check(&mut self) {
+        self.take_evicted();
+        let owners: BTreeSet<_> = self.memory.bricks.iter().map(|(_, b)| b.id).collect();
+        assert_eq!(self.resident, owners, "nobody was told of an eviction");
         let Self { memory, device, .. } = self;
         let [directory, tables] = device;
         memory.flush(|array, first, entries| {

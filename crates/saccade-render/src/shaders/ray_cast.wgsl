@@ -1,10 +1,9 @@
 // One ray per pixel, front to back, through whatever bricks are there.
 //
 // A ray is cut into segments of half a voxel of the level wanted at their start, measured along the
-// ray; each is sampled once. Bricks are looked up one by one and all segments in one are sampled
-// without further lookups. See the crate's documentation for the rules an image follows.
+// ray; each is sampled once. The residency octree tells which can be skipped; other bricks are
+// looked up one by one, and all segments in one are sampled without further lookups. See the crate's documentation for the rules an image follows.
 
-@group(0) @binding(6) var<storage, read> transfer: Transfer;
 @group(0) @binding(7) var bricks: texture_3d<f32>;
 @group(0) @binding(8) var bricks_sampler: sampler;
 @group(0) @binding(9) var image: texture_storage_2d<rgba8unorm, write>;
@@ -54,7 +53,7 @@ fn is_transparent(slot: u32) -> bool {
     let range = slot_ranges[slot];
     let low = range & 0xffu;
     let high = (range >> 8u) & 0xffu;
-    return transfer.opaque_before[high + 1u] == transfer.opaque_before[low];
+    return is_range_hidden(low, high);
 }
 
 fn color_of(stored: f32) -> vec4f {
@@ -94,24 +93,45 @@ fn widened(empty: Source, depth: f32, ray: vec3f) -> Source {
     return wide;
 }
 
-// The nearest level that is there, coarser ones first.
+// Bits below one.
+fn bits_below(bit: u32) -> u32 {
+    return select((1u << bit) - 1u, 0xffffffffu, bit >= 32u);
+}
+
+// The nearest level that is there, coarser ones first [001 alg. 7.2].
 fn substitute(wanted: Source, depth: f32, ray: vec3f, urgency: f32) -> Source {
-    for (var level = wanted.level + 1u; level < frame.level_count; level += 1u) {
+    var there = 0xffffffffu;
+    if (frame.flags & FLAG_RESIDENCY) != 0u {
+        there = levels_around(cell_at(depth, ray));
+    }
+    let coarsest = frame.level_count - 1u;
+    let preview = min(wanted.level + PREVIEW_LEVELS, coarsest);
+    var asked_for = 0u;
+    if misses_left > 0u {
+        asked_for = (1u << coarsest) | (1u << preview);
+    }
+    var coarser = (there | asked_for) & bits_below(frame.level_count) & ~bits_below(wanted.level + 1u);
+    while coarser != 0u {
+        let level = firstTrailingBit(coarser);
+        coarser &= coarser - 1u;
         var other = source(level, depth, ray);
         if is_known(other.found) {
             other.leaving = min(other.leaving, wanted.leaving);
             return other;
         }
         // Few bricks, soon there: before all others, and the one that shows everything first.
-        if level + 1u == frame.level_count {
+        if level == coarsest {
             mark_missed(other.found, urgency * 1e-6);
-        } else if level == wanted.level + PREVIEW_LEVELS {
+        } else if level == preview {
             mark_missed(other.found, urgency * 1e-3);
         }
     }
-    let finer = min(wanted.level, FINER_SUBSTITUTES);
-    for (var i = 1u; i <= finer; i += 1u) {
-        var other = source(wanted.level - i, depth, ray);
+    let finest = wanted.level - min(wanted.level, FINER_SUBSTITUTES);
+    var finer = there & bits_below(wanted.level) & ~bits_below(finest);
+    while finer != 0u {
+        let level = firstLeadingBit(finer);
+        finer &= bits_below(level);
+        var other = source(level, depth, ray);
         if other.found.entry >= FIRST_SLOT {
             other.leaving = min(other.leaving, wanted.leaving);
             return other;
@@ -131,6 +151,12 @@ fn depth_of_next(level: u32, ray: vec3f) -> f32 {
     return sqrt(here * next) / frame.pixel;
 }
 
+// Whole segments of a ray, one at least, whose samples, the first of them at `depth`, lie before
+// `until`.
+fn segments_until(until: f32, depth: f32, step: f32) -> u32 {
+    return u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
+}
+
 fn trace(pixel: vec2u) -> vec3f {
     let from_middle = (vec2f(pixel) + 0.5) / vec2f(frame.size) * 2.0 - 1.0;
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
@@ -146,6 +172,11 @@ fn trace(pixel: vec2u) -> vec3f {
     var level = 0u;
     var level_end = -1.0;
     var segments = 0u;
+    // What is drawn, found for a sample of some level; holds for more of them.
+    var drawn: Source;
+    var drawn_for = frame.level_count;
+    var missing = false;
+    var transparent = false;
     while start < depths.y && transmitted > TERMINATION && frame.level_count > 0u {
         while start >= level_end {
             if level_end >= 0.0 {
@@ -161,32 +192,61 @@ fn trace(pixel: vec2u) -> vec3f {
         let first = min(step, depths.y - start);
         let depth = start + sample_at * first;
 
-        var drawn = source(level, depth, ray);
-        var missing = drawn.found.entry < EMPTY;
-        if missing || drawn.found.stale {
-            mark_missed(drawn.found, depth * urgency);
-        }
-        if missing && (frame.flags & FLAG_SUBSTITUTE) != 0u {
-            drawn = substitute(drawn, depth, ray, depth * urgency);
-            missing = drawn.found.entry < EMPTY;
-        } else if drawn.found.entry == EMPTY && !drawn.found.stale {
-            drawn = widened(drawn, depth, ray);
+        // Depth of the first sample that may need another level, and of the ray's end.
+        var until = min(level_end + sample_at * step, depths.y + sample_at * step);
+        if (frame.flags & FLAG_OCTREE) != 0u {
+            let region = region_at(level, depth, ray);
+            until = min(until, region.leaving);
+            if region.hidden || region.uniform_ {
+                let count = segments_until(until, depth, step);
+                if !region.hidden {
+                    let color = color_of(region.stored);
+                    let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
+                    let opacity = opacity_of_length(color.a, thickness * nm_per_depth);
+                    light += transmitted * opacity * color.rgb;
+                    transmitted *= 1.0 - opacity;
+                }
+                start += f32(count) * step;
+                segments += count;
+                continue;
+            }
         }
 
-        // Whole segments whose samples lie in what was found, and whose starts are of this level.
-        let until = min(drawn.leaving, level_end + sample_at * step);
-        let left = min(ceil((until - depth) / step), ceil((depths.y - start) / step));
-        let count = u32(clamp(left, 1.0, f32(SEGMENTS_PER_DOUBLING)));
+        if level != drawn_for || depth >= drawn.leaving {
+            drawn = source(level, depth, ray);
+            drawn_for = level;
+            missing = drawn.found.entry < EMPTY;
+            if missing || drawn.found.stale {
+                mark_missed(drawn.found, depth * urgency);
+            }
+            if missing && (frame.flags & FLAG_SUBSTITUTE) != 0u {
+                drawn = substitute(drawn, depth, ray, depth * urgency);
+                missing = drawn.found.entry < EMPTY;
+            } else if drawn.found.entry == EMPTY && !drawn.found.stale {
+                drawn = widened(drawn, depth, ray);
+            }
+            transparent = true;
+            if drawn.found.entry >= FIRST_SLOT {
+                let slot = drawn.found.entry - FIRST_SLOT;
+                mark_brick_used(slot);
+                transparent = is_transparent(slot);
+            }
+        }
+        if transparent {
+            // Nothing to sample, as far as this brick goes.
+            until = min(level_end + sample_at * step, depths.y + sample_at * step);
+        }
+        until = min(until, drawn.leaving);
+        let count = segments_until(until, depth, step);
 
         if drawn.found.entry >= FIRST_SLOT {
             let slot = drawn.found.entry - FIRST_SLOT;
-            mark_brick_used(slot);
             let distance = i32(drawn.level) - i32(level);
             if distance != 0 {
                 substituted_levels = max(substituted_levels, u32(abs(distance)));
                 substituted += count;
             }
-            if !is_transparent(slot) {
+            if !transparent {
                 let grid = frame.brick_grid;
                 let cell = vec3u(slot % grid.x, slot / grid.x % grid.y, slot / (grid.x * grid.y));
                 let corner = vec3f(cell * BRICK_STORED_EDGE + BRICK_BORDER);
@@ -235,6 +295,7 @@ fn main(
         textureStore(image, pixel, vec4f(srgb_from_linear(color), 1.0));
         atomicAdd(&tallies[COUNT_SAMPLES], samples);
         atomicAdd(&tallies[COUNT_LOOKUPS], lookups);
+        atomicAdd(&tallies[COUNT_NODES], nodes_visited);
         atomicAdd(&tallies[COUNT_SUBSTITUTED], substituted);
         atomicMax(&tallies[MOST_SUBSTITUTED_LEVELS], substituted_levels);
         // Counted from the top, since zero means that no ray met the volume.
@@ -244,6 +305,7 @@ fn main(
     if local == 0u {
         atomicAdd(&report[COUNT_SAMPLES], atomicLoad(&tallies[COUNT_SAMPLES]));
         atomicAdd(&report[COUNT_LOOKUPS], atomicLoad(&tallies[COUNT_LOOKUPS]));
+        atomicAdd(&report[COUNT_NODES], atomicLoad(&tallies[COUNT_NODES]));
         atomicAdd(&report[COUNT_SUBSTITUTED], atomicLoad(&tallies[COUNT_SUBSTITUTED]));
         atomicMax(&report[MOST_SUBSTITUTED_LEVELS], atomicLoad(&tallies[MOST_SUBSTITUTED_LEVELS]));
         atomicMax(&report[FINEST_LEVEL], atomicLoad(&tallies[FINEST_LEVEL]));

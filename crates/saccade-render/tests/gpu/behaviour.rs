@@ -14,7 +14,7 @@ use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
     BrickVoxels, Delivery, DeliveryError, FrameReport, Gpu, Renderer, RendererError,
-    RendererOptions, View,
+    RendererOptions, Traversal, View,
 };
 
 use crate::harness::{deliver, frame, gpu, psnr, read, settle};
@@ -63,8 +63,16 @@ fn all_levels_of_a_constant_volume_transmit_what_they_should() {
     let volume = Arc::new(Volume::new("v", UVec3::new(300, 200, 40), voxel_nm).unwrap());
     let transmitted = 0.8_f64.powf(40.0 * 20.0 / 100.0);
     let mut steps = Vec::new();
-    for lod_bias in [-2.0, 0.0, 1.0, 2.0, 3.0] {
-        let mut renderer = Renderer::new(&gpu, volume.clone(), RendererOptions::default()).unwrap();
+    let traversals = [Traversal::PageTables, Traversal::ResidencyOctree];
+    for (traversal, lod_bias) in traversals
+        .into_iter()
+        .flat_map(|t| [-2.0, 0.0, 1.0, 2.0, 3.0].map(|bias| (t, bias)))
+    {
+        let options = RendererOptions {
+            traversal,
+            ..RendererOptions::default()
+        };
+        let mut renderer = Renderer::new(&gpu, volume.clone(), options).unwrap();
         renderer.set_transfer_function(&transfer);
         let camera = Camera {
             fov: 0.5,
@@ -95,6 +103,7 @@ fn all_levels_of_a_constant_volume_transmit_what_they_should() {
         steps[0] > 2 * steps[4],
         "the steps were meant to differ: {steps:?}"
     );
+    assert_eq!(steps[5..], [0; 5], "all alike, and nothing to sample");
 }
 
 #[test]
@@ -245,19 +254,24 @@ fn what_the_transfer_function_hides_is_not_sampled() {
         opacity: Vec::new(),
         ..scene.transfer.clone()
     };
+    let before = read(&renderer);
     renderer.set_transfer_function(&hidden);
     let report = frame(&mut renderer, &view);
-    assert!(
-        report.statistics.bricks_used > 0,
-        "hidden bricks stay: the next change may show them"
-    );
+    assert!(report.is_complete());
     assert_eq!(report.statistics.samples, 0);
+    assert_eq!(report.statistics.lookups, 0, "hidden bricks are not needed");
     assert!(
         read(&renderer)
             .rgba
             .chunks_exact(4)
             .all(|p| p == [0, 0, 0, 255])
     );
+    renderer.set_transfer_function(&scene.transfer);
+    assert!(
+        frame(&mut renderer, &view).is_complete(),
+        "they stay while there is room: the next change may show them"
+    );
+    assert!(read(&renderer) == before);
 }
 
 #[test]

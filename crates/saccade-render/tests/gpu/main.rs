@@ -9,6 +9,7 @@
 mod behaviour;
 mod functions;
 mod harness;
+mod octree;
 mod oracle;
 mod pictures;
 mod scene;

@@ -153,6 +153,25 @@ pub(crate) fn tissue() -> Scene {
     )
 }
 
+/// A few bright spots in matter that is dim, and nowhere quite empty.
+pub(crate) fn specks() -> Scene {
+    let transfer = ramp(
+        Polarity::Bright,
+        ColorMap::Gray,
+        &[(0.4, 0.0), (0.7, 0.8)],
+        20.0,
+    );
+    let extent = UVec3::new(142, 129, 75);
+    let size = extent.as_dvec3() * 4.0;
+    let seeds: Vec<DVec3> = (0..9).map(|n| halton(n) * size).collect();
+    Scene::new(extent, DVec3::splat(4.0), transfer, move |nm| {
+        let near = seeds.iter().map(|s| s.distance(nm));
+        let near = near.fold(f64::INFINITY, f64::min);
+        let dim = 30.0 + 20.0 * (nm.x / 7.0).sin() * (nm.y / 5.0).cos() + (nm.z / 3.0).sin();
+        dim + 200.0 * (1.0 - near / 40.0).max(0.0)
+    })
+}
+
 /// Points that fill the unit cube evenly.
 fn halton(n: u32) -> DVec3 {
     let radical = |base: u32| {

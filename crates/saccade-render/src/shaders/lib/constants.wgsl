@@ -14,6 +14,8 @@ const STALE = 0x80000000u;
 const FLAG_SUBSTITUTE = 1u;
 const FLAG_FALSE_COLORS = 2u;
 const FLAG_JITTER = 4u;
+const FLAG_OCTREE = 8u;
+const FLAG_RESIDENCY = 16u;
 
 const COUNTERS = 16u;
 const COUNT_MISSES = 0u;
@@ -23,7 +25,18 @@ const COUNT_LOOKUPS = 3u;
 const COUNT_SUBSTITUTED = 4u;
 const MOST_SUBSTITUTED_LEVELS = 5u;
 const FINEST_LEVEL = 6u;
-const TALLIES = 7u;
+const COUNT_NODES = 7u;
+const TALLIES = 8u;
+
+const MOST_DEPTHS = 24u;
+const SIBLINGS = 8u;
+const NODE_CHILDREN = 0u;
+const NODE_CHANNEL = 1u;
+const NODE_CHANNEL_WORDS = 4u;
+const NODE_BINS = 0u;
+const NODE_RANGE = 1u;
+const NODE_VALID = 2u;
+const NODE_RESIDENT = 3u;
 
 const MISSES = 4096u;
 const MISSES_PER_RAY = 4u;

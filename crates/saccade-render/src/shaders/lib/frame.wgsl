@@ -7,8 +7,26 @@ struct Level {
     directory_base: u32,  // first entry of the level in the page directory
     anchor: vec3i,        // [bricks of the level]
     voxels_per_nm: vec3f, // voxels of the level per nanometre
+    values_depth: u32,    // deepest nodes of the octree that know values of the level
     bricks: vec3u,        // bricks per axis
     directory: vec3u,     // directory entries per axis
+}
+
+// Nodes of one depth of the residency octree; the root's depth is 0.
+struct Depth {
+    shift: vec3u,   // edge of a node [log2 of cells]
+    residency: u32, // levels whose bricks are noted at this depth, as bits
+    bits: vec3u,    // how often each axis was halved since the depth above
+}
+
+// The residency octree as seen from the eye, in cells from the low corner of the anchor cell.
+struct Octree {
+    eye: vec3f,
+    node_words: u32,
+    anchor: vec3i,       // cell near the eye
+    cells_per_nm: vec3f,
+    cells: vec3u,        // cells that the volume touches, per axis
+    depths: array<Depth, MOST_DEPTHS>,
 }
 
 struct Frame {
@@ -29,10 +47,12 @@ struct Frame {
     size: vec2u,            // of the picture [pixels]
     usage_words: u32,       // words of slot usage in the report
     levels: array<Level, MAX_LEVELS>,
+    octree: Octree,
 }
 
 // Colours by stored value, and which values are seen at all.
 struct Transfer {
     colors: array<vec4f, TABLE_LEN>,       // linear RGB, extinction [1/nm]
     opaque_before: array<u32, 257>,        // entries below that are not transparent
+    visible_bins: u32,                     // a bit per eight entries: any that is not transparent
 }

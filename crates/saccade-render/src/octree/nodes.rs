@@ -1,0 +1,296 @@
+//! Where nodes are kept: blocks of eight siblings, as shaders read them.
+
+use super::values::Values;
+use crate::layout::{
+    NODE_BINS, NODE_CHANNEL, NODE_CHANNEL_WORDS, NODE_CHILDREN, NODE_RANGE, NODE_RESIDENT,
+    NODE_VALID, SIBLINGS,
+};
+
+/// What a node knows about a channel from what was noted at the node itself.
+///
+/// What its children know together is not part of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Own {
+    pub(crate) values: Values,
+    /// Levels for whose samples the values hold, as bits.
+    pub(crate) valid: u32,
+}
+
+impl Own {
+    pub(crate) const NOTHING: Self = Self {
+        values: Values::NONE,
+        valid: 0,
+    };
+    /// Space past the volume's end: no level has a sample there.
+    pub(crate) const OUTSIDE: Self = Self {
+        values: Values::NONE,
+        valid: u32::MAX,
+    };
+}
+
+/// What a node says about a channel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Known {
+    pub(crate) values: Values,
+    /// Levels for whose samples the values hold, as bits.
+    pub(crate) valid: u32,
+    /// Levels with a resident brick that overlaps the node, as bits.
+    pub(crate) resident: u32,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Block {
+    /// Node whose children these are; the root's block has none.
+    parent: u32,
+    /// When it was last written to.
+    touched: u64,
+    in_use: bool,
+    dirty: bool,
+}
+
+/// Nodes, in blocks of eight. Block 0 holds the root and seven nodes that are never used.
+#[derive(Debug)]
+pub(crate) struct Nodes {
+    channels: u32,
+    capacity: u32,
+    words: Vec<u32>,
+    own: Vec<Own>,
+    blocks: Vec<Block>,
+    free: Vec<u32>,
+    dirty: Vec<u32>,
+    used: u32,
+    /// Where the search for a block to forget goes on.
+    hand: u32,
+    now: u64,
+}
+
+/// The root.
+pub(crate) const ROOT: u32 = 0;
+/// Blocks looked at in search of one to forget.
+const SEARCH: u32 = 512;
+
+impl Nodes {
+    /// A root that knows nothing. At most `capacity` blocks, two at least.
+    pub(crate) fn new(channels: u32, capacity: u32) -> Self {
+        let mut nodes = Self {
+            channels,
+            capacity: capacity.max(2),
+            words: Vec::new(),
+            own: Vec::new(),
+            blocks: Vec::new(),
+            free: Vec::new(),
+            dirty: Vec::new(),
+            used: 0,
+            hand: 0,
+            now: 0,
+        };
+        nodes.add(ROOT, |_| Own::NOTHING);
+        nodes
+    }
+
+    /// Words of a node.
+    pub(crate) fn stride(&self) -> u32 {
+        NODE_CHANNEL + self.channels * NODE_CHANNEL_WORDS
+    }
+
+    pub(crate) fn channels(&self) -> u32 {
+        self.channels
+    }
+
+    /// `(in use, capacity)` \[blocks\].
+    pub(crate) fn blocks(&self) -> (u32, u32) {
+        (self.used, self.capacity)
+    }
+
+    /// Blocks written to since the last [`Self::flush`].
+    pub(crate) fn dirty(&self) -> usize {
+        self.dirty.len()
+    }
+
+    /// Hands out what changed since the last call: first word, words. Forgets it.
+    pub(crate) fn flush(&mut self, mut upload: impl FnMut(u32, &[u32])) {
+        self.dirty.sort_unstable();
+        let per_block = self.stride() * SIBLINGS;
+        let mut dirty = self.dirty.drain(..).peekable();
+        while let Some(first) = dirty.next() {
+            let mut end = first + 1;
+            while dirty.next_if_eq(&end).is_some() {
+                end += 1;
+            }
+            for block in &mut self.blocks[first as usize..end as usize] {
+                block.dirty = false;
+            }
+            let [from, to] = [first, end].map(|block| (block * per_block) as usize);
+            upload(first * per_block, &self.words[from..to]);
+        }
+    }
+
+    /// Something happens from now on that is newer than what was.
+    pub(crate) fn tick(&mut self) {
+        self.now += 1;
+    }
+
+    /// Keeps a node from being forgotten until the next [`Self::tick`].
+    pub(crate) fn touch(&mut self, node: u32) {
+        self.blocks[(node / SIBLINGS) as usize].touched = self.now;
+    }
+
+    /// First child of a node, if it has any.
+    pub(crate) fn children(&self, node: u32) -> Option<u32> {
+        let block = self.words[self.word(node) + NODE_CHILDREN as usize];
+        (block != 0).then_some(block * SIBLINGS)
+    }
+
+    /// Gives a node eight children and returns the first; `None` when there is no room.
+    ///
+    /// `own` tells what a child knows from the start.
+    pub(crate) fn split(&mut self, node: u32, own: impl Fn(u32) -> Own) -> Option<u32> {
+        debug_assert!(self.children(node).is_none(), "a node has eight children");
+        if self.used == self.capacity {
+            self.forget_some()?;
+        }
+        let block = self.add(node, own);
+        self.write(node, NODE_CHILDREN, block);
+        Some(block * SIBLINGS)
+    }
+
+    fn add(&mut self, parent: u32, own: impl Fn(u32) -> Own) -> u32 {
+        let fresh = Block {
+            parent,
+            touched: self.now,
+            in_use: true,
+            dirty: false,
+        };
+        self.used += 1;
+        let block = if let Some(block) = self.free.pop() {
+            // The device may be about to get what was there before.
+            let dirty = self.blocks[block as usize].dirty;
+            self.blocks[block as usize] = Block { dirty, ..fresh };
+            block
+        } else {
+            self.blocks.push(fresh);
+            let nodes = self.blocks.len() * SIBLINGS as usize;
+            self.words.resize(nodes * self.stride() as usize, 0);
+            self.own
+                .resize(nodes * self.channels as usize, Own::NOTHING);
+            u32::try_from(self.blocks.len() - 1).expect("at most the capacity")
+        };
+        for index in 0..SIBLINGS {
+            let node = block * SIBLINGS + index;
+            let first = self.word(node);
+            self.words[first + NODE_CHILDREN as usize] = 0;
+            let own = own(index);
+            for channel in 0..self.channels {
+                self.set_own(node, channel, own);
+                let first = self.channel_word(node, channel);
+                self.words[first..][..NODE_CHANNEL_WORDS as usize].copy_from_slice(&[
+                    own.values.bins,
+                    own.values.range_word(),
+                    own.valid,
+                    0,
+                ]);
+            }
+        }
+        self.mark(block);
+        block
+    }
+
+    /// Takes a node's children away. They have none themselves.
+    pub(crate) fn join(&mut self, node: u32) {
+        let Some(first) = self.children(node) else {
+            return;
+        };
+        debug_assert!((first..first + SIBLINGS).all(|child| self.children(child).is_none()));
+        let block = first / SIBLINGS;
+        self.blocks[block as usize].in_use = false;
+        self.free.push(block);
+        self.used -= 1;
+        self.write(node, NODE_CHILDREN, 0);
+    }
+
+    /// Forgets the detail in some block that no resident brick is noted in: of those that were
+    /// looked at, the one written to longest ago. What its nodes knew together stays known.
+    fn forget_some(&mut self) -> Option<()> {
+        let count = u32::try_from(self.blocks.len()).expect("at most the capacity");
+        let mut oldest = None;
+        for _ in 0..SEARCH.min(count) {
+            self.hand = (self.hand + 1) % count;
+            let block = self.blocks[self.hand as usize];
+            let first = self.hand * SIBLINGS;
+            let nodes = || first..first + SIBLINGS;
+            // What was written to just now is being grown at this moment.
+            let may_go = block.in_use
+                && self.hand != 0
+                && block.touched < self.now
+                && nodes().all(|node| self.children(node).is_none())
+                && nodes().all(|node| {
+                    (0..self.channels).all(|channel| self.known(node, channel).resident == 0)
+                });
+            if may_go && oldest.is_none_or(|(touched, _)| block.touched < touched) {
+                oldest = Some((block.touched, block.parent));
+            }
+        }
+        let (_, parent) = oldest?;
+        for channel in 0..self.channels {
+            let Known { values, valid, .. } = self.known(parent, channel);
+            self.set_own(parent, channel, Own { values, valid });
+        }
+        self.join(parent);
+        Some(())
+    }
+
+    pub(crate) fn own(&self, node: u32, channel: u32) -> Own {
+        self.own[(node * self.channels + channel) as usize]
+    }
+
+    /// Changes what was noted at a node; what it says follows from [`Self::set_known`].
+    pub(crate) fn set_own(&mut self, node: u32, channel: u32, own: Own) {
+        self.own[(node * self.channels + channel) as usize] = own;
+    }
+
+    pub(crate) fn known(&self, node: u32, channel: u32) -> Known {
+        let word = |word: u32| self.words[self.channel_word(node, channel) + word as usize];
+        Known {
+            values: Values::from_words(word(NODE_BINS), word(NODE_RANGE)),
+            valid: word(NODE_VALID),
+            resident: word(NODE_RESIDENT),
+        }
+    }
+
+    pub(crate) fn set_known(&mut self, node: u32, channel: u32, known: Known) {
+        let first = NODE_CHANNEL + channel * NODE_CHANNEL_WORDS;
+        self.write(node, first + NODE_BINS, known.values.bins);
+        self.write(node, first + NODE_RANGE, known.values.range_word());
+        self.write(node, first + NODE_VALID, known.valid);
+        self.write(node, first + NODE_RESIDENT, known.resident);
+    }
+
+    fn write(&mut self, node: u32, word: u32, value: u32) {
+        let at = self.word(node) + word as usize;
+        if self.words[at] != value {
+            self.words[at] = value;
+            self.mark(node / SIBLINGS);
+        }
+    }
+
+    fn mark(&mut self, block: u32) {
+        let state = &mut self.blocks[block as usize];
+        if !std::mem::replace(&mut state.dirty, true) {
+            self.dirty.push(block);
+        }
+    }
+
+    fn word(&self, node: u32) -> usize {
+        node as usize * self.stride() as usize
+    }
+
+    fn channel_word(&self, node: u32, channel: u32) -> usize {
+        self.word(node) + (NODE_CHANNEL + channel * NODE_CHANNEL_WORDS) as usize
+    }
+
+    /// All words, as the device is to have them.
+    #[cfg(test)]
+    pub(crate) fn words(&self) -> &[u32] {
+        &self.words
+    }
+}

@@ -1,0 +1,255 @@
+//! Which values samples of a region may have.
+
+use std::ops::Range;
+
+use saccade_core::brick::{BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS};
+
+/// Edge of a stored brick \[voxels\].
+const STORED: usize = BRICK_STORED_EDGE as usize;
+/// Gaps between stored voxels along an axis: in each, a sample lies between two voxels.
+const GAPS: usize = STORED - 1;
+/// Stored values per bin.
+const BIN_LOG2: u32 = 3;
+
+/// Bounds of the stored values that a sample may have, and which of 32 bins between them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Values {
+    /// A bit per eight stored values. Interpolation between two voxels reaches all bins between
+    /// theirs, and these are set as well.
+    pub(crate) bins: u32,
+    /// Smallest.
+    pub(crate) min: u16,
+    /// Largest.
+    pub(crate) max: u16,
+}
+
+impl Values {
+    /// No value at all: there is no sample.
+    pub(crate) const NONE: Self = Self {
+        bins: 0,
+        min: u16::MAX,
+        max: 0,
+    };
+    /// Nothing was acquired: every sample is 0.
+    pub(crate) const ZERO: Self = Self {
+        bins: 1,
+        min: 0,
+        max: 0,
+    };
+
+    /// Anything from `min` to `max`.
+    pub(crate) fn between(min: u8, max: u8) -> Self {
+        Self {
+            bins: bins_between(min, max.max(min)),
+            min: min.into(),
+            max: max.max(min).into(),
+        }
+    }
+
+    /// What either may be.
+    pub(crate) fn or(self, other: Self) -> Self {
+        Self {
+            bins: self.bins | other.bins,
+            min: self.min.min(other.min),
+            max: self.max.max(other.max),
+        }
+    }
+
+    /// Both bounds in a word, as shaders read them.
+    pub(crate) fn range_word(self) -> u32 {
+        u32::from(self.min) | u32::from(self.max) << 16
+    }
+
+    /// The inverse of [`Self::range_word`], with the bins.
+    pub(crate) fn from_words(bins: u32, range: u32) -> Self {
+        let [a, b, c, d] = range.to_le_bytes();
+        Self {
+            bins,
+            min: u16::from_le_bytes([a, b]),
+            max: u16::from_le_bytes([c, d]),
+        }
+    }
+}
+
+/// Bins from that of `low` to that of `high`, which is not smaller.
+fn bins_between(low: u8, high: u8) -> u32 {
+    (u32::MAX << (low >> BIN_LOG2)) & (u32::MAX >> (31 - (high >> BIN_LOG2)))
+}
+
+/// What the samples of a brick may be, as a whole and, where it pays, by region.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct BrickValues {
+    pub(crate) whole: Values,
+    /// Per region, x fastest; none where all are alike.
+    pub(crate) regions: Option<Vec<Values>>,
+}
+
+impl BrickValues {
+    /// The same everywhere.
+    pub(crate) fn uniform(whole: Values) -> Self {
+        Self {
+            whole,
+            regions: None,
+        }
+    }
+
+    /// Of a brick's stored voxels with their border, for regions that are ranges of gaps per axis.
+    ///
+    /// Gap `i` lies between stored voxels `i` and `i + 1`; a sample in it is interpolated from
+    /// the eight voxels around.
+    pub(crate) fn of_voxels(voxels: &[u8], regions: [&[Range<usize>]; 3]) -> Self {
+        debug_assert_eq!(voxels.len(), BRICK_STORED_VOXELS);
+        let low = reached(voxels, u8::min);
+        let high = reached(voxels, u8::max);
+        let [xs, ys, zs] = regions;
+        let mut values = Vec::with_capacity(xs.len() * ys.len() * zs.len());
+        for z in zs {
+            for y in ys {
+                values.extend(xs.iter().map(|x| of_gaps(&low, &high, [x, y, z])));
+            }
+        }
+        let all = 0..GAPS;
+        let whole = of_gaps(&low, &high, [&all, &all, &all]);
+        let alike = values.iter().all(|v| *v == whole);
+        Self {
+            whole,
+            regions: (!alike).then_some(values),
+        }
+    }
+}
+
+/// Per gap, x fastest, the smallest (or largest) of the eight voxels around it.
+fn reached(voxels: &[u8], of: impl Fn(u8, u8) -> u8 + Copy) -> Vec<u8> {
+    let pairs = |a: &[u8], b: &[u8], to: &mut [u8]| {
+        for ((to, a), b) in to.iter_mut().zip(a).zip(b) {
+            *to = of(*a, *b);
+        }
+    };
+    let mut along_x = vec![0; STORED * STORED * GAPS];
+    for (row, to) in voxels
+        .chunks_exact(STORED)
+        .zip(along_x.chunks_exact_mut(GAPS))
+    {
+        pairs(row, &row[1..], to);
+    }
+    let mut along_y = vec![0; STORED * GAPS * GAPS];
+    for (slice, to) in along_x
+        .chunks_exact(STORED * GAPS)
+        .zip(along_y.chunks_exact_mut(GAPS * GAPS))
+    {
+        pairs(slice, &slice[GAPS..], to);
+    }
+    let mut along_z = vec![0; GAPS * GAPS * GAPS];
+    pairs(&along_y, &along_y[GAPS * GAPS..], &mut along_z);
+    along_z
+}
+
+fn of_gaps(low: &[u8], high: &[u8], [x, y, z]: [&Range<usize>; 3]) -> Values {
+    let (mut bins, mut min, mut max) = (0, u8::MAX, 0);
+    for z in z.clone() {
+        for y in y.clone() {
+            let row = (z * GAPS + y) * GAPS;
+            let row = row + x.start..row + x.end;
+            for (&low, &high) in low[row.clone()].iter().zip(&high[row]) {
+                bins |= bins_between(low, high);
+                min = min.min(low);
+                max = max.max(high);
+            }
+        }
+    }
+    if bins == 0 {
+        return Values::NONE;
+    }
+    Values {
+        bins,
+        min: min.into(),
+        max: max.into(),
+    }
+}
+
+const _: () = assert!(GAPS == BRICK_EDGE as usize + 1);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bins_are_those_between() {
+        assert_eq!(bins_between(0, 0), 1);
+        assert_eq!(bins_between(7, 8), 0b11);
+        assert_eq!(bins_between(255, 255), 1 << 31);
+        assert_eq!(bins_between(0, 255), u32::MAX);
+        for low in 0..=255_u8 {
+            for high in [low, low.saturating_add(9), 255] {
+                let want = (low >> 3..=high >> 3).fold(0, |bins, bin| bins | 1_u32 << bin);
+                assert_eq!(bins_between(low, high), want, "{low} to {high}");
+            }
+        }
+    }
+
+    #[test]
+    fn words_keep_ranges() {
+        let values = Values::between(3, 200);
+        assert_eq!(Values::from_words(values.bins, values.range_word()), values);
+        assert_eq!(Values::NONE.or(values), values);
+    }
+
+    /// Against interpolation at many places.
+    #[test]
+    #[expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
+    fn samples_stay_within_what_their_region_says() {
+        let mut random = 7_u32;
+        let voxels: Vec<u8> = (0..BRICK_STORED_VOXELS)
+            .map(|i| {
+                random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                // Mostly one of two values, so that many bins stay free in places.
+                match (random >> 16, i % STORED / 12) {
+                    (0..8, _) => 250,
+                    (_, 0) => 20,
+                    _ => 90,
+                }
+            })
+            .collect();
+        let thirds = [0..9, 8..17, 16..25, 24..33];
+        let halves = [0..17, 16..33];
+        let values = BrickValues::of_voxels(&voxels, [&thirds, &halves, &halves]);
+        let regions = values.regions.clone().unwrap();
+        assert!(regions.iter().any(|v| v.bins.count_ones() < 20));
+        let at = |[x, y, z]: [usize; 3]| f64::from(voxels[(z * STORED + y) * STORED + x]);
+        let mut tight = 0;
+        for n in 0..40_000_u32 {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            // A position in the brick, and the gap it lies in.
+            let position = [0, 10, 20].map(|shift| f64::from(random >> shift & 1023) / 32.0);
+            let gap = position.map(|p| (p + 0.5).floor() as usize);
+            let t = position.map(|p| (p + 0.5).fract());
+            let mut sample = 0.0;
+            for corner in 0..8_usize {
+                let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
+                let weight: f64 = (0..3)
+                    .map(|a| if offset[a] == 1 { t[a] } else { 1.0 - t[a] })
+                    .product();
+                sample += weight * at(std::array::from_fn(|a| gap[a] + offset[a]));
+            }
+            let [x, y, z] = [position[0] / 8.0, position[1] / 16.0, position[2] / 16.0]
+                .map(|region| region as usize);
+            let region = regions[(z * 2 + y) * 4 + x];
+            let bin = (sample / 8.0) as u32;
+            assert!(
+                region.bins >> bin & 1 == 1,
+                "sample {n}: {sample} at {position:?}"
+            );
+            assert!(f64::from(region.min) <= sample && sample <= f64::from(region.max));
+            tight += u32::from(region.bins.count_ones() < 32);
+        }
+        assert!(tight > 100, "regions that exclude nothing prove nothing");
+    }
+
+    #[test]
+    fn bricks_of_one_value_have_no_regions() {
+        let quarters = [0..17, 16..33];
+        let brick =
+            BrickValues::of_voxels(&[9; BRICK_STORED_VOXELS], [&quarters, &quarters, &quarters]);
+        assert_eq!(brick, BrickValues::uniform(Values::between(9, 9)));
+    }
+}
