@@ -4,6 +4,7 @@ mod construct;
 mod first_light;
 mod ingest;
 mod render;
+mod serve;
 
 use anyhow::Result;
 
@@ -31,6 +32,14 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: render::IDS,
         measure: render::measure,
+    },
+    Group {
+        ids: serve::SLOWLORIS_IDS,
+        measure: serve::measure_slowloris,
+    },
+    Group {
+        ids: serve::NGINX_IDS,
+        measure: serve::measure_nginx,
     },
 ];
 

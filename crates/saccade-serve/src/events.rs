@@ -10,7 +10,7 @@ use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures::{Stream, StreamExt, stream};
 use saccade_source::Change;
-use tokio::sync::watch;
+use tokio::sync::{OwnedSemaphorePermit, watch};
 
 use crate::volumes::Published;
 
@@ -22,6 +22,7 @@ pub(crate) fn events(
     published: Arc<Published>,
     headers: &HeaderMap,
     mut closing: watch::Receiver<bool>,
+    place: OwnedSemaphorePermit,
 ) -> Response {
     let seen = headers.get("last-event-id").map(|id| {
         // An id that is not ours cannot be caught up from: 0 is before every revision we keep.
@@ -30,7 +31,9 @@ pub(crate) fn events(
             .and_then(|id| id.trim().parse().ok())
             .unwrap_or(0)
     });
-    let events = changes(published, seen).map(|change| {
+    let events = changes(published, seen).map(move |change| {
+        // Given back when the stream ends.
+        let _ = &place;
         let event = Event::default()
             .event("change")
             .id(change.revision.to_string());

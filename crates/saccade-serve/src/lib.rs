@@ -38,6 +38,8 @@
 //! | 404 | no such volume, level or chunk, or nothing was acquired there: the fill value |
 //! | 304, 412, 416 | what a client's own conditions ask for |
 //! | 503 with `Retry-After` | not ready, or a failure that may pass |
+//! | 503 with `Retry-After`, also | more connections, requests or event streams at once than [`Limits`] allow |
+//! | 421, 403 | a name that the server does not have, an origin that it does not let read ([`Access`]) |
 //! | 500 | reading failed for good; the log has the reason |
 //!
 //! Refusals are JSON, `{"error": …, "known": […]}`, and carry the headers that let pages of other
@@ -46,7 +48,8 @@
 //! # What it does not do
 //!
 //! It holds no state but the recent changes of each volume, limits no builds (sources do), knows no
-//! users and no encryption: it listens on this computer only, unless told otherwise.
+//! users and no encryption: it listens on this computer only, unless told otherwise. It reads no
+//! bodies of requests.
 
 mod archive;
 mod assets;
@@ -63,6 +66,6 @@ mod thumbnail;
 mod volumes;
 
 pub use archive::{OfferError, follow_archive, offer_archive};
-pub use server::{Compress, Options, ServeError, Server};
+pub use server::{Access, Compress, Limits, Options, Origins, ServeError, Server};
 pub use status::{CatalogStatus, Quarantined, Status, StatusError, StatusSource};
 pub use volumes::Volumes;

@@ -1,7 +1,9 @@
 //! Which address is answered by what.
 
 use std::net::SocketAddr;
+use std::ops::Deref;
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::extract::{ConnectInfo, Path, Request, State};
 use axum::http::header::{
@@ -14,34 +16,65 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use serde_json::{Value, json};
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tower_http::CompressionLevel;
 use tower_http::compression::CompressionLayer;
-use tower_http::cors::{Any, CorsLayer};
+use tower_http::cors::{AllowOrigin, Any, CorsLayer};
 
 use crate::assets::asset;
 use crate::events;
 use crate::formats::{Entry, Format, Unknown};
-use crate::http::{internal, mark_encoding, not_found};
+use crate::http::{internal, mark_encoding, not_found, try_again};
 use crate::index::index;
 use crate::pieces::piece;
-use crate::server::{Compress, Compressible, Options};
+use crate::server::{Compress, Compressible, Gate, Options, Origins};
 use crate::status::Status;
 use crate::thumbnail::thumbnail;
 use crate::volumes::{Published, Volumes};
 
 /// What every handler needs.
 #[derive(Clone)]
-pub(crate) struct App {
-    pub(crate) volumes: Volumes,
-    pub(crate) options: Options,
-    pub(crate) closing: watch::Receiver<bool>,
+pub(crate) struct App(Arc<Shared>);
+
+pub(crate) struct Shared {
+    volumes: Volumes,
+    options: Options,
+    closing: watch::Receiver<bool>,
+    gate: Gate,
+    requests: Semaphore,
+    streams: Arc<Semaphore>,
+}
+
+impl App {
+    pub(crate) fn new(volumes: Volumes, options: Options, closing: watch::Receiver<bool>) -> Self {
+        Self(Arc::new(Shared {
+            volumes,
+            closing,
+            gate: Gate::new(&options.access),
+            requests: Semaphore::new(options.limits.requests),
+            streams: Arc::new(Semaphore::new(options.limits.streams)),
+            options,
+        }))
+    }
+}
+
+impl Deref for App {
+    type Target = Shared;
+
+    fn deref(&self) -> &Shared {
+        &self.0
+    }
 }
 
 /// All addresses, with what they share: compression, tags, and access from pages of other origins.
 pub(crate) fn router(app: App) -> Router {
+    let allowed = match &app.options.access.origins {
+        Origins::Any => AllowOrigin::any(),
+        // What is no header value is no origin either.
+        Origins::Only(list) => AllowOrigin::list(list.iter().filter_map(|o| o.parse().ok())),
+    };
     let shared = CorsLayer::new()
-        .allow_origin(Any)
+        .allow_origin(allowed)
         .allow_methods([Method::GET, Method::HEAD])
         .allow_headers(Any)
         .expose_headers([
@@ -52,7 +85,7 @@ pub(crate) fn router(app: App) -> Router {
             ETAG,
             RETRY_AFTER,
         ])
-        .max_age(std::time::Duration::from_secs(86_400));
+        .max_age(Duration::from_secs(86_400));
     let marked = |_: StatusCode, _: Version, _: &HeaderMap, extensions: &Extensions| {
         extensions.get::<Compressible>().is_some()
     };
@@ -86,8 +119,24 @@ pub(crate) fn router(app: App) -> Router {
         .layer(from_fn_with_state(app.clone(), spare_near_clients))
         .layer(gzip)
         .layer(map_response(mark_encoding))
+        .layer(from_fn_with_state(app.clone(), admit))
         .layer(shared)
         .with_state(app)
+}
+
+/// Refuses strangers, and more requests at once than can be answered.
+async fn admit(State(app): State<App>, request: Request, next: Next) -> Response {
+    if let Some(refusal) = app.gate.refuse(request.version(), request.headers()) {
+        return refusal;
+    }
+    match app.requests.try_acquire() {
+        Ok(_answering) => next.run(request).await,
+        Err(_) => too_much("the server is busy"),
+    }
+}
+
+fn too_much(error: &str) -> Response {
+    try_again(error, Duration::from_secs(1))
 }
 
 /// Compression costs a client on the same computer more than it saves.
@@ -157,9 +206,13 @@ async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
 }
 
 async fn changes(State(app): State<App>, Path(name): Path<String>, headers: HeaderMap) -> Response {
-    match find(&app, &name) {
-        Ok(published) => events::events(published, &headers, app.closing),
-        Err(refusal) => *refusal,
+    let published = match find(&app, &name) {
+        Ok(published) => published,
+        Err(refusal) => return *refusal,
+    };
+    match app.streams.clone().try_acquire_owned() {
+        Ok(place) => events::events(published, &headers, app.closing.clone(), place),
+        Err(_) => too_much("too many clients listen"),
     }
 }
 

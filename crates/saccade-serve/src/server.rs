@@ -1,27 +1,37 @@
 //! Listening and stopping.
 
+mod accept;
+mod access;
+mod connections;
+mod limits;
+mod paced;
+
 use std::future::Future;
 use std::io;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use axum::serve::ListenerExt;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
+
+pub(crate) use access::Gate;
+pub use access::{Access, Origins};
+pub use limits::Limits;
 
 use crate::routes::{App, router};
 use crate::volumes::Volumes;
 
-/// How long answers under way may take once the server is to stop.
-const LAST_ANSWERS: Duration = Duration::from_secs(2);
-
 /// Settings of a server.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Options {
     /// Longest time that building a chunk may take before its client is told to ask again.
     pub patience: Duration,
     /// Whom to send compressed answers, of those who accept them.
     pub compress: Compress,
+    /// How much clients may take.
+    pub limits: Limits,
+    /// Who may ask.
+    pub access: Access,
 }
 
 /// Whom to send large answers compressed.
@@ -38,6 +48,8 @@ impl Options {
     pub const DEFAULT: Self = Self {
         patience: Duration::from_secs(20),
         compress: Compress::FarClients,
+        limits: Limits::DEFAULT,
+        access: Access::DEFAULT,
     };
 }
 
@@ -76,12 +88,6 @@ pub enum ServeError {
         source: io::Error,
         /// As asked for.
         address: SocketAddr,
-    },
-    /// Serving ended; see the source.
-    #[error("the server stopped")]
-    Stopped {
-        /// What the system says.
-        source: io::Error,
     },
 }
 
@@ -126,7 +132,7 @@ impl Server {
     ///
     /// # Errors
     ///
-    /// [`ServeError::Stopped`] when the system ends it.
+    /// None at present: what happens to one connection ends no others.
     pub async fn run(
         self,
         volumes: Volumes,
@@ -134,33 +140,17 @@ impl Server {
         stop: impl Future<Output = ()> + Send + 'static,
     ) -> Result<(), ServeError> {
         let (close, closing) = watch::channel(false);
-        let app = App {
-            volumes,
-            options,
-            closing: closing.clone(),
-        };
-        let service = router(app).into_make_service_with_connect_info::<SocketAddr>();
-        // Chunks are many and small: waiting to fill packets would only delay them.
-        let listener = self.listener.tap_io(|stream| {
-            if let Err(error) = stream.set_nodelay(true) {
-                log::debug!("cannot turn off packet delay: {error}");
-            }
-        });
-        let stopped = async move {
+        let limits = options.limits;
+        let app = App::new(volumes, options, closing.clone());
+        let stopping = async {
             stop.await;
             close.send_replace(true);
-        };
-        let serving = axum::serve(listener, service).with_graceful_shutdown(stopped);
-        let mut closing = closing;
-        let cut = async move {
-            if closing.wait_for(|closing| *closing).await.is_err() {
-                std::future::pending::<()>().await;
-            }
-            tokio::time::sleep(LAST_ANSWERS).await;
+            // Kept to the end: a sender that is gone would read as one that stops.
+            std::future::pending::<()>().await;
         };
         tokio::select! {
-            served = serving.into_future() => served.map_err(|source| ServeError::Stopped { source }),
-            () = cut => Ok(()),
+            () = accept::accept(self.listener, router(app), limits, closing) => Ok(()),
+            () = stopping => Ok(()),
         }
     }
 }

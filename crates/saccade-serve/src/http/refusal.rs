@@ -16,7 +16,12 @@ struct Refusal {
     known: Vec<String>,
 }
 
-fn refusal(status: StatusCode, error: impl Into<String>, known: Vec<String>) -> Response {
+/// An answer that says no, and why; `known` lists what could have been asked for instead.
+pub(crate) fn refusal(
+    status: StatusCode,
+    error: impl Into<String>,
+    known: Vec<String>,
+) -> Response {
     let body = Json(Refusal {
         error: error.into(),
         known,

@@ -6,6 +6,7 @@ mod chunks;
 mod described;
 mod events;
 mod formats;
+mod hostile;
 mod remote;
 mod server;
 

@@ -39,6 +39,14 @@ impl VolumeSource for Troubled {
     }
 }
 
+/// A source whose reads never end.
+pub(super) fn never() -> Arc<dyn VolumeSource> {
+    Arc::new(Troubled {
+        volume: Arc::new(volume()),
+        trouble: |_| None,
+    })
+}
+
 fn failed(id: ChunkId, transient: bool) -> Option<ChunkError> {
     let source = Arc::new(std::io::Error::other("disk on fire"));
     Some(ChunkError::Failed {

@@ -12,7 +12,7 @@ use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, run as ingest};
 use saccade_ingest::simulate::SimulateConfig;
-use saccade_serve::{Options, Server, Volumes, offer_archive};
+use saccade_serve::{Server, Volumes, offer_archive};
 use saccade_source::stitched::StitchedOptions;
 use tempfile::TempDir;
 
@@ -161,7 +161,7 @@ impl Demo {
             anyhow::Ok(())
         };
         let stopped = stop.clone();
-        let serving = server.run(volumes.clone(), Options::DEFAULT, async move {
+        let serving = server.run(volumes.clone(), self.at.options(), async move {
             stopped.cancelled().await;
         });
         tokio::try_join!(working, async { Ok(serving.await?) })?;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Result;
 use clap::Args;
 use saccade_archive::VisualizationArchive;
-use saccade_serve::{Options, Server, Volumes, follow_archive, offer_archive};
+use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, offer_archive};
 use saccade_source::stitched::StitchedOptions;
 
 use crate::interrupt::interrupted;
@@ -33,11 +33,35 @@ pub(crate) struct At {
     /// Port to listen on; 0 for any free one
     #[arg(long, default_value_t = 8080)]
     port: u16,
+
+    /// Another name by which clients call this server, beside localhost, addresses in numbers and
+    /// this computer's own name; may be given several times
+    #[arg(long, value_name = "NAME")]
+    allow_host: Vec<String>,
+
+    /// Let only the server's own pages read, and those of this origin, such as
+    /// https://viewer.example; may be given several times. Without it all pages may
+    #[arg(long, value_name = "ORIGIN")]
+    allow_origin: Vec<String>,
 }
 
 impl At {
     pub(crate) fn address(&self) -> SocketAddr {
         SocketAddr::new(self.host, self.port)
+    }
+
+    pub(crate) fn options(&self) -> Options {
+        let origins = match &*self.allow_origin {
+            [] => Origins::Any,
+            only => Origins::Only(only.to_vec()),
+        };
+        Options {
+            access: Access {
+                hosts: self.allow_host.clone(),
+                origins,
+            },
+            ..Options::DEFAULT
+        }
     }
 }
 
@@ -56,7 +80,7 @@ impl Serve {
         tell(&server.url());
         let follow = follow_archive(&volumes, &archive, options, POLL);
         tokio::select! {
-            served = server.run(volumes.clone(), Options::DEFAULT, interrupted()) => served?,
+            served = server.run(volumes.clone(), self.at.options(), interrupted()) => served?,
             () = follow => {}
         }
         Ok(())

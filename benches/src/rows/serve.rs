@@ -1,0 +1,392 @@
+//! The server under load: beside nginx, and among clients that mean no good.
+
+use std::fs;
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail, ensure};
+use glam::{DVec3, UVec3};
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+use saccade_serve::{Options, Server, Volumes};
+use saccade_source::memory::ArraySource;
+use saccade_source::{Chunk, ChunkId, VolumeSource};
+use tempfile::TempDir;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::TcpStream;
+use tokio::runtime::Runtime;
+
+use crate::clock::Stopwatch;
+use crate::report::Row;
+use crate::rows::runtime;
+
+const SLOWLORIS: &str = "serve.slowloris_p99_ratio";
+const NGINX: &str = "serve.vs_nginx";
+
+pub(crate) const SLOWLORIS_IDS: &[&str] = &[SLOWLORIS];
+pub(crate) const NGINX_IDS: &[&str] = &[NGINX];
+
+const RUNS: usize = 3;
+
+// --- among slow clients -------------------------------------------------------------------------
+
+/// Connections that send a byte now and then.
+const SLOW: usize = 10_000;
+/// Between two bytes of one of them.
+const BYTE: Duration = Duration::from_secs(1);
+/// Requests of the good client, one after the other.
+const REQUESTS: usize = 4000;
+
+pub(crate) fn measure_slowloris() -> Result<Vec<Row>> {
+    let served = Served::new()?;
+    let client = runtime()?;
+    let keys = Arc::new(served.keys());
+    let mut ratios = Vec::new();
+    let mut p99 = [Vec::new(), Vec::new()];
+    let slow = slow_sockets();
+    for _ in 0..RUNS {
+        let idle = client.block_on(good_client(served.address, &keys))?;
+        let attackers = runtime()?;
+        for index in 0..slow {
+            attackers.spawn(slow_client(served.address, index, slow));
+        }
+        // All are connected, and have begun to send.
+        client.block_on(tokio::time::sleep(3 * BYTE));
+        let attacked = client.block_on(good_client(served.address, &keys))?;
+        attackers.shutdown_background();
+        client.block_on(tokio::time::sleep(BYTE));
+        ratios.push(attacked / idle);
+        p99[0].push(idle * 1e3);
+        p99[1].push(attacked * 1e3);
+    }
+    let row = Row::new(SLOWLORIS, "of the idle p99", ratios)
+        .setting("slow sockets", slow)
+        .setting("a byte every", "1 s each")
+        .setting("requests per run", REQUESTS)
+        .setting("chunk", "64 x 64 x 32, from memory")
+        .setting("idle p99 [ms]", rounded(&p99[0]))
+        .setting("p99 among them [ms]", rounded(&p99[1]));
+    Ok(vec![row])
+}
+
+/// As many as the process may have, beside what the server keeps of them.
+fn slow_sockets() -> usize {
+    let limits = fs::read_to_string("/proc/self/limits").unwrap_or_default();
+    let line = limits
+        .lines()
+        .find_map(|l| l.strip_prefix("Max open files"));
+    let files = line.and_then(|l| l.split_whitespace().next()?.parse::<usize>().ok());
+    SLOW.min(files.unwrap_or(256) / 2)
+}
+
+/// A request that is never finished; begun again when the server ends the connection.
+async fn slow_client(server: SocketAddr, index: usize, of: usize) {
+    // Spread over the first second.
+    tokio::time::sleep(BYTE.mul_f64(index as f64 / of as f64)).await;
+    loop {
+        if let Ok(mut stream) = TcpStream::connect(server).await {
+            let mut sent = stream
+                .write_all(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
+                .await;
+            while sent.is_ok() {
+                tokio::time::sleep(BYTE).await;
+                sent = stream.write_all(b"z").await;
+            }
+        }
+        tokio::time::sleep(BYTE).await;
+    }
+}
+
+/// The 99th percentile of one client's requests \[s\].
+async fn good_client(server: SocketAddr, keys: &[String]) -> Result<f64> {
+    let mut client = Client::connect(server).await?;
+    let mut choice = Choice(1);
+    let mut times = Vec::with_capacity(REQUESTS);
+    for _ in 0..REQUESTS {
+        let watch = Stopwatch::start();
+        client.get(choice.of(keys)).await?;
+        times.push(watch.elapsed().as_secs_f64());
+    }
+    Ok(percentile99(times))
+}
+
+// --- beside nginx -------------------------------------------------------------------------------
+
+const CLIENTS: usize = 64;
+const LOAD: Duration = Duration::from_secs(10);
+
+pub(crate) fn measure_nginx() -> Result<Vec<Row>> {
+    let Some(program) = nginx_program() else {
+        eprintln!(
+            "  left out: there is no nginx (./dev bench fetches Debian's, or name one in SACCADE_NGINX)"
+        );
+        return Ok(Vec::new());
+    };
+    let served = Served::new()?;
+    let nginx = Nginx::start(&program, &served)?;
+    let client = runtime()?;
+    let keys = Arc::new(served.keys());
+    let mut ratios = Vec::new();
+    let mut rates = [Vec::new(), Vec::new()];
+    let mut p99 = [Vec::new(), Vec::new()];
+    for _ in 0..RUNS {
+        for (which, server) in [served.address, nginx.address].into_iter().enumerate() {
+            let (rate, slowest) = client.block_on(load(server, &keys))?;
+            rates[which].push(rate);
+            p99[which].push(slowest * 1e3);
+        }
+        ratios.push(rates[0][rates[0].len() - 1] / rates[1][rates[1].len() - 1]);
+    }
+    let row = Row::new(NGINX, "of nginx's requests per second", ratios)
+        .setting("clients", CLIENTS)
+        .setting("seconds per run", LOAD.as_secs())
+        .setting(
+            "chunk",
+            "64 x 64 x 32, from memory, nginx's from cached files",
+        )
+        .setting("requests per second", rounded(&rates[0]))
+        .setting("nginx's", rounded(&rates[1]))
+        .setting("p99 [ms]", rounded(&p99[0]))
+        .setting("nginx's p99 [ms]", rounded(&p99[1]));
+    Ok(vec![row])
+}
+
+/// Requests per second of all clients, and the 99th percentile \[s\].
+async fn load(server: SocketAddr, keys: &Arc<Vec<String>>) -> Result<(f64, f64)> {
+    let watch = Stopwatch::start();
+    let clients = (0..CLIENTS).map(|seed| {
+        let keys = keys.clone();
+        tokio::spawn(async move {
+            let mut client = Client::connect(server).await?;
+            let mut choice = Choice(seed as u64);
+            let mut times = Vec::new();
+            while watch.elapsed() < LOAD {
+                let one = Stopwatch::start();
+                client.get(choice.of(&keys)).await?;
+                times.push(one.elapsed().as_secs_f64());
+            }
+            anyhow::Ok(times)
+        })
+    });
+    let mut times = Vec::new();
+    for client in clients.collect::<Vec<_>>() {
+        times.extend(client.await??);
+    }
+    let rate = times.len() as f64 / watch.elapsed().as_secs_f64();
+    Ok((rate, percentile99(times)))
+}
+
+/// nginx, serving the same bytes as files.
+struct Nginx {
+    process: Child,
+    address: SocketAddr,
+    _folder: TempDir,
+}
+
+impl Nginx {
+    fn start(program: &Path, served: &Served) -> Result<Self> {
+        let folder = TempDir::with_prefix("saccade-nginx-")?;
+        // Its workers may run as somebody else.
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755))?;
+        for (key, bytes) in &served.chunks {
+            let file = folder.path().join(key.trim_start_matches('/'));
+            fs::create_dir_all(file.parent().context("a chunk has a folder")?)?;
+            fs::write(file, bytes)?;
+        }
+        let address = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?.local_addr()?;
+        let root = folder.path().display();
+        let temporary = ["client_body", "proxy", "fastcgi", "uwsgi", "scgi"];
+        let temporary = temporary
+            .map(|of| format!("{of}_temp_path {root}/{of};"))
+            .join(" ");
+        let settings = format!(
+            "worker_processes auto; daemon off; pid {root}/pid; error_log stderr error; \
+             events {{ worker_connections 1024; }} \
+             http {{ access_log off; sendfile on; tcp_nopush on; tcp_nodelay on; \
+             keepalive_requests 1000000000; open_file_cache max=10000; {temporary} \
+             default_type application/octet-stream; server {{ listen {address}; root {root}; }} }}"
+        );
+        let file = folder.path().join("nginx.conf");
+        fs::write(&file, settings)?;
+        let process = Command::new(program)
+            .args(["-e", "stderr", "-p"])
+            .arg(folder.path())
+            .arg("-c")
+            .arg(&file)
+            .stdin(Stdio::null())
+            .spawn()
+            .with_context(|| format!("cannot run {}", program.display()))?;
+        let nginx = Self {
+            process,
+            address,
+            _folder: folder,
+        };
+        let watch = Stopwatch::start();
+        while std::net::TcpStream::connect(address).is_err() {
+            ensure!(
+                watch.elapsed() < Duration::from_secs(5),
+                "nginx does not answer"
+            );
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        Ok(nginx)
+    }
+}
+
+impl Drop for Nginx {
+    fn drop(&mut self) {
+        // Its workers end with it only when it is asked.
+        let process = self.process.id().to_string();
+        drop(Command::new("kill").arg(process).status());
+        drop(self.process.wait());
+    }
+}
+
+fn nginx_program() -> Option<PathBuf> {
+    let named = std::env::var_os("SACCADE_NGINX").map(PathBuf::from);
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let found = std::env::split_paths(&path).map(|folder| folder.join("nginx"));
+    let usual = Some(PathBuf::from("/usr/sbin/nginx"));
+    named
+        .into_iter()
+        .chain(found)
+        .chain(usual)
+        .find(|file| file.is_file())
+}
+
+// --- what both need -----------------------------------------------------------------------------
+
+/// A server in this process, with threads of its own, and what it serves.
+struct Served {
+    _runtime: Runtime,
+    address: SocketAddr,
+    chunks: Vec<(String, Vec<u8>)>,
+}
+
+impl Served {
+    fn new() -> Result<Self> {
+        let extent = UVec3::new(512, 512, 128);
+        let mut volume = Volume::new("em", extent, DVec3::splat(8.0))?;
+        volume.levels.truncate(1);
+        let mut choice = Choice(7);
+        let voxels = VoxelBox::of_size(extent).iter();
+        // Never 0: no chunk is absent.
+        let values = voxels
+            .map(|_| u8::try_from(choice.next() >> 56).unwrap_or(1) | 1)
+            .collect();
+        let source = Arc::new(ArraySource::new(volume, values)?);
+        let runtime = runtime()?;
+        let (server, chunks) = runtime.block_on(async {
+            let server = Server::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).await?;
+            let mut chunks = Vec::new();
+            for chunk in VoxelBox::of_size(source.volume().chunks(0)).iter() {
+                let id = ChunkId {
+                    channel: 0,
+                    level: 0,
+                    chunk,
+                };
+                let Chunk::Voxels(bytes) = source.read(id).await? else {
+                    bail!("{id} is empty")
+                };
+                let UVec3 { x, y, z } = chunk;
+                chunks.push((format!("/v/em/zarr/0/c/0/{z}/{y}/{x}"), bytes.to_vec()));
+            }
+            anyhow::Ok((server, chunks))
+        })?;
+        let address = server.address();
+        let volumes = Volumes::new();
+        let _inside = runtime.enter();
+        volumes.publish(source, None);
+        runtime.spawn(server.run(volumes, Options::DEFAULT, std::future::pending()));
+        drop(_inside);
+        Ok(Self {
+            _runtime: runtime,
+            address,
+            chunks,
+        })
+    }
+
+    fn keys(&self) -> Vec<String> {
+        self.chunks.iter().map(|(key, _)| key.clone()).collect()
+    }
+}
+
+/// One connection that is kept, and as little work as possible on this side of it.
+struct Client {
+    stream: BufReader<TcpStream>,
+    line: String,
+    body: Vec<u8>,
+}
+
+impl Client {
+    async fn connect(server: SocketAddr) -> Result<Self> {
+        let stream = TcpStream::connect(server).await?;
+        stream.set_nodelay(true)?;
+        Ok(Self {
+            stream: BufReader::with_capacity(64 * 1024, stream),
+            line: String::new(),
+            body: Vec::new(),
+        })
+    }
+
+    async fn get(&mut self, key: &str) -> Result<()> {
+        let request = format!("GET {key} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        self.stream.write_all(request.as_bytes()).await?;
+        let mut length = None;
+        let mut first = true;
+        loop {
+            self.line.clear();
+            ensure!(
+                self.stream.read_line(&mut self.line).await? > 0,
+                "the connection ended"
+            );
+            let line = self.line.trim_end();
+            if std::mem::take(&mut first) {
+                ensure!(line.starts_with("HTTP/1.1 200"), "{key}: {line}");
+            } else if line.is_empty() {
+                break;
+            } else if let Some((name, value)) = line.split_once(':')
+                && name.eq_ignore_ascii_case("content-length")
+            {
+                length = Some(value.trim().parse::<usize>()?);
+            }
+        }
+        self.body
+            .resize(length.context("an answer without length")?, 0);
+        self.stream.read_exact(&mut self.body).await?;
+        Ok(())
+    }
+}
+
+/// Splitmix64: the same choice in every run.
+struct Choice(u64);
+
+impl Choice {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        mixed ^ (mixed >> 31)
+    }
+
+    fn of<'a>(&mut self, keys: &'a [String]) -> &'a str {
+        let at = self.next() % keys.len() as u64;
+        &keys[usize::try_from(at).unwrap_or(0)]
+    }
+}
+
+fn percentile99(mut times: Vec<f64>) -> f64 {
+    times.sort_by(f64::total_cmp);
+    times
+        .get(times.len() * 99 / 100)
+        .copied()
+        .unwrap_or(f64::NAN)
+}
+
+fn rounded(values: &[f64]) -> Vec<f64> {
+    values.iter().map(|v| (v * 100.0).round() / 100.0).collect()
+}

@@ -1,0 +1,322 @@
+//! Clients that are slow, many, or strangers, on real sockets.
+
+use std::time::Duration;
+
+use reqwest::{Method, StatusCode};
+use saccade_serve::{Access, Limits, Options, Origins};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpSocket, TcpStream};
+use tokio::time::{sleep, timeout};
+
+use super::server::never;
+use super::{CHUNK, Served, header, run, serve, serve_source};
+
+/// Deadlines of these tests.
+const SHORT: Duration = Duration::from_millis(300);
+const CHUNK_PATH: &str = "v/em/zarr/0/c/0/0/0/1";
+
+fn limited(limits: Limits) -> Options {
+    Options {
+        limits,
+        ..Options::DEFAULT
+    }
+}
+
+fn address(url: &str) -> &str {
+    url.trim_start_matches("http://").trim_end_matches('/')
+}
+
+async fn connect(url: &str) -> TcpStream {
+    TcpStream::connect(address(url)).await.unwrap()
+}
+
+fn request(path: &str) -> String {
+    format!("GET /{path} HTTP/1.1\r\nHost: localhost\r\n\r\n")
+}
+
+/// Everything until the server ends the connection.
+async fn rest(stream: &mut TcpStream) -> String {
+    let mut bytes = Vec::new();
+    // A reset ends it as well.
+    drop(stream.read_to_end(&mut bytes).await);
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
+async fn is_well(served: &Served) -> bool {
+    let answer = timeout(Duration::from_secs(5), served.get(CHUNK_PATH)).await;
+    answer.is_ok_and(|answer| answer.status() == StatusCode::OK)
+}
+
+/// Sends a request in pieces; what comes back until the server ends the connection.
+async fn drip(served: &Served, pause: Duration) -> String {
+    let mut stream = connect(&served.url).await;
+    let text = request(CHUNK_PATH).replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n");
+    for piece in text.as_bytes().chunks(20) {
+        if stream.write_all(piece).await.is_err() {
+            break;
+        }
+        sleep(pause).await;
+    }
+    rest(&mut stream).await
+}
+
+#[test]
+fn a_head_that_drips_in_is_not_waited_for() {
+    run(async {
+        let head = SHORT;
+        let served = serve(limited(Limits {
+            head,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let (slow, brisk) = tokio::join!(drip(&served, SHORT), drip(&served, SHORT / 30));
+        assert_eq!(slow, "");
+        assert!(brisk.starts_with("HTTP/1.1 200"), "{brisk}");
+        assert!(is_well(&served).await);
+    });
+}
+
+#[test]
+fn connections_that_do_nothing_end() {
+    run(async {
+        let head = SHORT;
+        let served = serve(limited(Limits {
+            head,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let mut silent = connect(&served.url).await;
+        let mut idle = connect(&served.url).await;
+        idle.write_all(request("volumes.json").as_bytes())
+            .await
+            .unwrap();
+        let (silent, idle) = tokio::join!(rest(&mut silent), rest(&mut idle));
+        assert_eq!(silent, "");
+        assert!(idle.starts_with("HTTP/1.1 200"), "{idle}");
+    });
+}
+
+#[test]
+fn a_body_that_nobody_asked_for_is_not_read() {
+    run(async {
+        let served = serve(Options::DEFAULT).await;
+        for method in ["GET", "POST"] {
+            let mut stream = connect(&served.url).await;
+            let head = format!(
+                "{method} /volumes.json HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\nx"
+            );
+            stream.write_all(head.as_bytes()).await.unwrap();
+            let answer = timeout(Duration::from_secs(5), rest(&mut stream)).await;
+            assert!(
+                answer
+                    .expect("the body is waited for")
+                    .starts_with("HTTP/1.1 ")
+            );
+        }
+    });
+}
+
+/// More answers than the system keeps for a client.
+const MANY: usize = 4000;
+
+async fn ask_for_many(served: &Served) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.set_recv_buffer_size(4096).unwrap();
+    let mut stream = socket
+        .connect(address(&served.url).parse().unwrap())
+        .await
+        .unwrap();
+    let asked = request(CHUNK_PATH).repeat(MANY);
+    // The server may end it before it has read everything.
+    drop(timeout(Duration::from_secs(5), stream.write_all(asked.as_bytes())).await);
+    stream
+}
+
+#[test]
+fn a_reader_that_does_not_read_is_not_written_to_for_ever() {
+    run(async {
+        let pace = SHORT;
+        let served = serve(limited(Limits {
+            pace,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let mut asleep = ask_for_many(&served).await;
+        sleep(4 * SHORT).await;
+        assert!(is_well(&served).await);
+        let taken = rest(&mut asleep).await.len();
+        let all = MANY * CHUNK.element_product() as usize;
+        assert!(taken < all, "{taken} bytes were sent");
+    });
+}
+
+#[test]
+fn a_reader_that_reads_gets_everything() {
+    run(async {
+        let pace = SHORT;
+        let served = serve(limited(Limits {
+            pace,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let socket = connect(&served.url).await;
+        let (mut reading, mut writing) = socket.into_split();
+        let asked = request(CHUNK_PATH).repeat(MANY - 1)
+            + &request(CHUNK_PATH).replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n");
+        let (written, read) = tokio::join!(writing.write_all(asked.as_bytes()), async {
+            let mut bytes = Vec::new();
+            reading.read_to_end(&mut bytes).await.map(|_| bytes)
+        });
+        written.unwrap();
+        let all = MANY * CHUNK.element_product() as usize;
+        assert!(read.unwrap().len() > all);
+    });
+}
+
+#[test]
+fn idle_connections_make_room() {
+    run(async {
+        let connections = 20;
+        let served = serve(limited(Limits {
+            connections,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        assert!(is_well(&served).await);
+        let mut idle = Vec::new();
+        for _ in 0..5 * connections {
+            idle.push(connect(&served.url).await);
+            assert!(is_well(&served).await);
+        }
+        let mut ended = 0;
+        for stream in &mut idle {
+            let read = timeout(Duration::from_millis(10), stream.read_u8()).await;
+            ended += usize::from(read.is_ok());
+        }
+        assert!(ended >= 4 * connections, "only {ended} were ended");
+        assert!(ended < 5 * connections, "more were ended than had to");
+    });
+}
+
+#[test]
+fn what_is_too_much_is_told_to_come_again() {
+    run(async {
+        let options = limited(Limits {
+            connections: 3,
+            requests: 2,
+            ..Limits::DEFAULT
+        });
+        let (url, _stop, _running) = serve_source(never(), options).await;
+        let mut hanging = Vec::new();
+        for _ in 0..2 {
+            let mut stream = connect(&url).await;
+            stream
+                .write_all(request(CHUNK_PATH).as_bytes())
+                .await
+                .unwrap();
+            hanging.push(stream);
+        }
+        // A third is shed as a request; connections beyond it find no place while it asks.
+        sleep(SHORT).await;
+        let shed = reqwest::get(format!("{url}volumes.json")).await.unwrap();
+        assert_eq!(shed.status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert_eq!(header(shed.headers(), "retry-after"), Some("1"));
+        assert_eq!(
+            header(shed.headers(), "access-control-allow-origin"),
+            Some("*")
+        );
+        // Who gives up makes room.
+        hanging.pop();
+        let again = async {
+            loop {
+                let answer = reqwest::get(format!("{url}volumes.json")).await;
+                if answer.is_ok_and(|answer| answer.status() == StatusCode::OK) {
+                    break;
+                }
+                sleep(SHORT / 10).await;
+            }
+        };
+        timeout(Duration::from_secs(10), again).await.unwrap();
+    });
+}
+
+#[test]
+fn where_all_connections_are_being_answered_the_next_reads_why() {
+    run(async {
+        let connections = 2;
+        let options = limited(Limits {
+            connections,
+            ..Limits::DEFAULT
+        });
+        let (url, _stop, _running) = serve_source(never(), options).await;
+        let mut hanging = Vec::new();
+        for _ in 0..connections {
+            let mut stream = connect(&url).await;
+            stream
+                .write_all(request(CHUNK_PATH).as_bytes())
+                .await
+                .unwrap();
+            hanging.push(stream);
+        }
+        sleep(SHORT).await;
+        let mut next = connect(&url).await;
+        let answer = rest(&mut next).await;
+        assert!(
+            answer.starts_with("HTTP/1.1 503") && answer.contains("Retry-After: 1"),
+            "{answer}"
+        );
+    });
+}
+
+#[test]
+fn streams_of_changes_are_counted() {
+    run(async {
+        let served = serve(limited(Limits {
+            streams: 1,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let first = served.get("v/em/events").await;
+        assert_eq!(first.status(), StatusCode::OK);
+        let second = served.get("v/em/events").await;
+        assert_eq!(second.status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert!(is_well(&served).await);
+        drop(first);
+        while served.get("v/em/events").await.status() != StatusCode::OK {
+            sleep(SHORT / 10).await;
+        }
+    });
+}
+
+#[test]
+fn strangers_names_and_pages_are_refused() {
+    run(async {
+        let access = Access {
+            hosts: vec!["em.example".to_owned()],
+            origins: Origins::Only(vec!["https://viewer.example".to_owned()]),
+        };
+        let served = serve(Options {
+            access,
+            ..Options::DEFAULT
+        })
+        .await;
+        let ask = async |host: &str, origin: Option<&str>| {
+            let mut request = served.request(Method::GET, CHUNK_PATH).header("host", host);
+            if let Some(origin) = origin {
+                request = request.header("origin", origin);
+            }
+            let response = request.send().await.unwrap();
+            let allowed = header(response.headers(), "access-control-allow-origin");
+            (response.status().as_u16(), allowed.map(str::to_owned))
+        };
+        assert_eq!(ask("em.example:8080", None).await.0, 200);
+        assert_eq!(ask("127.0.0.1", None).await.0, 200);
+        assert_eq!(ask("evil.example", None).await.0, 421);
+        let good = "https://viewer.example".to_owned();
+        assert_eq!(ask("localhost", Some(&good)).await, (200, Some(good)));
+        assert_eq!(
+            ask("localhost", Some("https://evil.example")).await,
+            (403, None)
+        );
+    });
+}
