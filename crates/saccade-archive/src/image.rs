@@ -1,5 +1,8 @@
 //! Images as microscopes write them, decoded to 8-bit grey.
-
+//!
+//! What counts is what an image shows, not how it is stored: palettes and colours whose channels are
+//! equal everywhere are grey, fewer bits are spread over the whole range, white-is-zero is turned
+//! round. What shows colours is refused: which of them should be seen is not ours to guess.
 //!
 //! [`decode`] tells a file that ends early, which whoever writes it may still complete, from one
 //! that is damaged and one that is of another kind: the first is waited for, the others are put
@@ -86,6 +89,19 @@ pub enum ImageError {
         /// Bits of one sample.
         bits: u32,
     },
+    /// A pixel is not grey.
+    #[error(
+        "the image is in colour (red, green, blue are {rgb:?} at pixel {x}, {y}), but the volume is \
+         grey; convert it to 8 bit grey, or write the channel that matters as an image of its own"
+    )]
+    Color {
+        /// Column of the first such pixel.
+        x: u32,
+        /// Its row.
+        y: u32,
+        /// Its red, green and blue.
+        rgb: [u8; 3],
+    },
     /// Whole, perhaps, but of a kind that cannot be read.
     #[error("this kind of image cannot be read ({what}); convert it to an 8-bit grey TIFF or PNG")]
     Unsupported {
@@ -117,7 +133,7 @@ impl ImageError {
 
 /// Decodes a TIFF, PNG or JPEG file, told apart by its first bytes.
 ///
-/// Only the first image of a file is read. Colours become luma (Rec. 601); alpha is ignored.
+/// Only the first image of a file is read; alpha is ignored.
 ///
 /// # Errors
 ///
@@ -161,26 +177,44 @@ fn allocate(len: usize) -> Result<Vec<u8>, ImageError> {
     Ok(voxels)
 }
 
-/// Grey values of interleaved ones, in place.
-fn luma(mut samples: Vec<u8>, channels: usize) -> Vec<u8> {
+/// Farthest that red, green and blue of a grey pixel lie apart where they are stored as they are:
+/// converting between colour spaces rounds.
+const EXACT: u8 = 4;
+
+/// The same for lossy storage, which keeps brightness well and colours roughly.
+const LOSSY: u8 = 24;
+
+/// Grey values of an image's interleaved ones, in place: of the first channel, or of three that are
+/// `apart` at most, and of any others nothing.
+fn gray(
+    (width, height): (u32, u32),
+    mut samples: Vec<u8>,
+    channels: usize,
+    apart: u8,
+) -> Result<GrayImage, ImageError> {
     let pixels = samples.len() / channels;
-    match channels {
-        1 => return samples,
-        2 => {
-            for pixel in 0..pixels {
-                samples[pixel] = samples[2 * pixel];
-            }
+    if channels == 2 {
+        for pixel in 0..pixels {
+            samples[pixel] = samples[2 * pixel];
         }
-        _ => {
-            for pixel in 0..pixels {
-                let [r, g, b] = [0, 1, 2].map(|c| u32::from(samples[channels * pixel + c]));
-                // Thousandths that add up to one: white stays 255.
-                let luma = (299 * r + 587 * g + 114 * b + 500) / 1000;
-                samples[pixel] = u8::try_from(luma).unwrap_or(u8::MAX);
+    } else if channels > 2 {
+        for pixel in 0..pixels {
+            let rgb = [0, 1, 2].map(|c| samples[channels * pixel + c]);
+            let [r, g, b] = rgb;
+            if r.max(g).max(b) - r.min(g).min(b) > apart {
+                // Both are less than the image's edges.
+                let place = |at: usize| u32::try_from(at).unwrap_or(u32::MAX);
+                let (x, y) = (pixel % width as usize, pixel / width as usize);
+                let (x, y) = (place(x), place(y));
+                return Err(ImageError::Color { x, y, rgb });
             }
+            // Rec. 601, in thousandths that add up to one: white stays 255.
+            let [r, g, b] = rgb.map(u32::from);
+            let luma = (299 * r + 587 * g + 114 * b + 500) / 1000;
+            samples[pixel] = u8::try_from(luma).unwrap_or(u8::MAX);
         }
     }
     samples.truncate(pixels);
     samples.shrink_to_fit();
-    samples
+    Ok(GrayImage::new(width, height, samples))
 }

@@ -1,15 +1,18 @@
-//! JPEG files. Of colours, the luma that they store is taken.
+//! JPEG files of 8 bits per sample.
 
-use turbojpeg::{Decompressor, Image, PixelFormat};
+use turbojpeg::{Colorspace, Decompressor, Image, PixelFormat};
 
 use super::sniff::{broken, check_jpeg};
-use super::{GrayImage, ImageError, allocate, check_size};
+use super::{GrayImage, ImageError, LOSSY, allocate, check_size, gray};
 
 /// Progressive files may refine the image as often as they like; this many times are enough.
 const MAX_SCANS: u32 = 500;
 
 pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
-    check_jpeg(bytes)?;
+    let bits = check_jpeg(bytes)?;
+    if bits != 8 {
+        return Err(ImageError::Depth { bits });
+    }
     let mut decoder = Decompressor::new().map_err(broken)?;
     decoder.set_scan_limit(MAX_SCANS).map_err(broken)?;
     let header = decoder.read_header(bytes).map_err(broken)?;
@@ -25,14 +28,23 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
             bytes.len()
         )));
     }
-    let mut voxels = allocate(pixels)?;
+    let (format, channels) = match header.colorspace {
+        Colorspace::Gray => (PixelFormat::GRAY, 1),
+        Colorspace::YCbCr | Colorspace::RGB => (PixelFormat::RGB, 3),
+        Colorspace::CMYK | Colorspace::YCCK => {
+            return Err(ImageError::Unsupported {
+                what: "a JPEG of four printing colours".to_owned(),
+            });
+        }
+    };
+    let mut voxels = allocate(pixels * channels)?;
     let image = Image {
         pixels: &mut voxels[..],
         width: header.width,
-        pitch: header.width,
+        pitch: header.width * channels,
         height: header.height,
-        format: PixelFormat::GRAY,
+        format,
     };
     decoder.decompress(bytes, image).map_err(broken)?;
-    Ok(GrayImage::new(width, height, voxels))
+    gray((width, height), voxels, channels, LOSSY)
 }

@@ -5,7 +5,7 @@ use std::io::{self, Cursor};
 use png::{BitDepth, ColorType, Decoder, DecodingError, Transformations};
 
 use super::sniff::{broken, check_png, incomplete};
-use super::{GrayImage, ImageError, allocate, check_size, luma};
+use super::{EXACT, GrayImage, ImageError, allocate, check_size, gray};
 
 pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
     check_png(bytes)?;
@@ -37,7 +37,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
     }
     let mut voxels = allocate(len)?;
     reader.next_frame(&mut voxels).map_err(sort)?;
-    Ok(GrayImage::new(width, height, luma(voxels, channels)))
+    gray((width, height), voxels, channels, EXACT)
 }
 
 fn sort(e: DecodingError) -> ImageError {

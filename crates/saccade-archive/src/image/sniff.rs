@@ -77,9 +77,10 @@ pub(super) fn check_png(bytes: &[u8]) -> Result<(), ImageError> {
     }
 }
 
-/// Checks that a JPEG file's segments go on to its end marker.
-pub(super) fn check_jpeg(bytes: &[u8]) -> Result<(), ImageError> {
+/// Checks that a JPEG file's segments go on to its end marker; the bits of a sample.
+pub(super) fn check_jpeg(bytes: &[u8]) -> Result<u32, ImageError> {
     let ends = || incomplete("it ends before its end marker");
+    let mut bits = None;
     let mut at = 2;
     loop {
         // Between segments, and within entropy-coded data: on to the next marker.
@@ -89,9 +90,13 @@ pub(super) fn check_jpeg(bytes: &[u8]) -> Result<(), ImageError> {
         });
         at += found.ok_or_else(ends)? + 2;
         match bytes[at - 1] {
-            0xd9 => return Ok(()),
+            0xd9 => return bits.ok_or_else(|| broken("it has no frame")),
             0x01 | 0xd8 => {}
-            _ => {
+            marker => {
+                // A frame's header begins with the bits of its samples; these three begin no frame.
+                if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
+                    bits = bytes.get(at + 2).copied().map(u32::from);
+                }
                 let Some(len) = bytes.get(at..).and_then(|rest| rest.first_chunk::<2>()) else {
                     return Err(ends());
                 };

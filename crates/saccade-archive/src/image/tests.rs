@@ -102,6 +102,23 @@ fn files(image: &GrayImage) -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
+/// Files of kinds that show the same, but are decoded in other ways.
+fn unusual_files(image: &GrayImage) -> Vec<(&'static str, Vec<u8>)> {
+    let size = [image.width, image.height].map(|edge| u16::try_from(edge).unwrap());
+    let rgb = channels(image, 3);
+    let (width, height) = (image.width as usize, image.height as usize);
+    let subsamp = turbojpeg::Subsamp::Sub2x2;
+    let packed = &image.voxels[..usize::from(size[0]).div_ceil(2) * usize::from(size[1])];
+    vec![
+        ("RGB TIFF", rgb_tiff(image.width, image.height, &rgb)),
+        ("RGB JPEG", rgb_jpeg(width, height, &rgb, subsamp)),
+        (
+            "TIFF of 4 bits",
+            raw_tiff(size, 4, &[(PHOTOMETRIC, 0)], packed),
+        ),
+    ]
+}
+
 #[test]
 fn images_come_back() {
     let image = texture(101, 67);
@@ -226,42 +243,246 @@ fn sixteen_bits_are_refused() {
     }
 }
 
-#[test]
-fn colours_become_luma() {
-    let colors = [
-        [255, 255, 255],
-        [0, 0, 0],
-        [255, 0, 0],
-        [0, 255, 0],
-        [0, 0, 255],
-        [10, 200, 90],
-    ];
-    let want = [255, 0, 76, 150, 29, 131];
-    let rgb: Vec<u8> = colors.iter().flatten().copied().collect();
-    let rgba: Vec<u8> = colors.iter().flat_map(|&[r, g, b]| [r, g, b, 7]).collect();
-    let mut tiff = Cursor::new(Vec::new());
-    TiffEncoder::new(&mut tiff)
+/// Pixels of an image as so many equal channels, and alpha after three.
+fn channels(image: &GrayImage, channels: usize) -> Vec<u8> {
+    let pixel = |&v: &u8| (0..channels).map(move |c| if c == 3 { 77 } else { v });
+    image.voxels.iter().flat_map(pixel).collect()
+}
+
+fn rgb_tiff(width: u32, height: u32, data: &[u8]) -> Vec<u8> {
+    let mut file = Cursor::new(Vec::new());
+    TiffEncoder::new(&mut file)
         .unwrap()
-        .write_image::<colortype::RGB8>(3, 2, &rgb)
+        .write_image::<colortype::RGB8>(width, height, data)
         .unwrap();
-    let png = |color, data: &[u8]| png_file(3, 2, color, BitDepth::Eight, data);
-    for file in [
-        tiff.into_inner(),
-        png(ColorType::Rgb, &rgb),
-        png(ColorType::Rgba, &rgba),
+    file.into_inner()
+}
+
+fn rgb_jpeg(width: usize, height: usize, data: &[u8], subsamp: turbojpeg::Subsamp) -> Vec<u8> {
+    let mut encoder = turbojpeg::Compressor::new().unwrap();
+    encoder.set_quality(75).unwrap();
+    encoder.set_subsamp(subsamp).unwrap();
+    encoder
+        .compress_to_vec(turbojpeg::Image {
+            pixels: data,
+            width,
+            pitch: 3 * width,
+            height,
+            format: turbojpeg::PixelFormat::RGB,
+        })
+        .unwrap()
+}
+
+fn palette_png(width: u32, height: u32, palette: &[u8], data: &[u8]) -> Vec<u8> {
+    let mut file = Vec::new();
+    let mut encoder = Encoder::new(&mut file, width, height);
+    encoder.set_color(ColorType::Indexed);
+    encoder.set_depth(BitDepth::Eight);
+    encoder.set_palette(palette.to_vec());
+    let mut writer = encoder.write_header().unwrap();
+    writer.write_image_data(data).unwrap();
+    drop(writer);
+    file
+}
+
+#[test]
+fn equal_channels_are_grey() {
+    let image = texture(37, 22);
+    let (rgb, rgba) = (channels(&image, 3), channels(&image, 4));
+    let png = |color, data: &[u8]| png_file(37, 22, color, BitDepth::Eight, data);
+    let ramp: Vec<u8> = (0..=255).flat_map(|v: u8| [255 - v; 3]).collect();
+    let turned: Vec<u8> = image.voxels.iter().map(|v| 255 - v).collect();
+    for (what, file) in [
+        ("RGB PNG", png(ColorType::Rgb, &rgb)),
+        ("RGBA PNG", png(ColorType::Rgba, &rgba)),
+        ("grey alpha PNG", {
+            let data: Vec<u8> = image.voxels.iter().flat_map(|&v| [v, 9]).collect();
+            png(ColorType::GrayscaleAlpha, &data)
+        }),
+        (
+            "PNG with a grey palette",
+            palette_png(37, 22, &ramp, &turned),
+        ),
+        ("RGB TIFF", rgb_tiff(37, 22, &rgb)),
     ] {
-        assert_eq!(decode(&file).unwrap().voxels, want);
+        let seen = decode(&file).unwrap_or_else(|e| panic!("{what}: {e}"));
+        assert!(seen == image, "{what}");
     }
-    let gray_alpha = png(
-        ColorType::GrayscaleAlpha,
-        &[1, 9, 2, 9, 3, 9, 4, 9, 5, 9, 6, 9],
-    );
-    assert_eq!(decode(&gray_alpha).unwrap().voxels, [1, 2, 3, 4, 5, 6]);
+    // What is lossy shows what the same file without colours would.
+    for subsamp in [turbojpeg::Subsamp::None, turbojpeg::Subsamp::Sub2x2] {
+        let seen = decode(&rgb_jpeg(37, 22, &rgb, subsamp)).unwrap();
+        let pairs = seen.voxels.iter().zip(&image.voxels);
+        let sum: u32 = pairs.map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
+        assert!(sum < 10 * 37 * 22, "{subsamp:?}: {sum}");
+    }
+}
+
+/// One pixel among many suffices; a shade that rounding makes does not.
+#[test]
+fn colours_are_refused_and_shown() {
+    let image = texture(37, 22);
+    let tinted = |[r, g, b]: [u8; 3]| {
+        let mut rgb = channels(&image, 3);
+        rgb[3 * (5 * 37 + 11)..][..3].copy_from_slice(&[r, g, b]);
+        rgb
+    };
+    let palette = |color: [u8; 3]| {
+        let mut palette: Vec<u8> = (0..=255).flat_map(|v: u8| [v; 3]).collect();
+        palette[3 * 250..][..3].copy_from_slice(&color);
+        let mut data: Vec<u8> = image.voxels.iter().map(|&v| v.min(249)).collect();
+        data[5 * 37 + 11] = 250;
+        palette_png(37, 22, &palette, &data)
+    };
+    let files = |color: [u8; 3]| {
+        let rgb = tinted(color);
+        [
+            png_file(37, 22, ColorType::Rgb, BitDepth::Eight, &rgb),
+            rgb_tiff(37, 22, &rgb),
+            palette(color),
+        ]
+    };
+    for file in files([90, 97, 99]) {
+        let error = decode(&file).unwrap_err();
+        let rgb = [90, 97, 99];
+        let place = matches!(error, ImageError::Color { x: 11, y: 5, rgb: seen } if seen == rgb);
+        assert!(place && !error.is_transient(), "{error:?}");
+        let said = error.to_string();
+        assert!(
+            said.contains("11, 5") && said.contains("8 bit grey"),
+            "{said}"
+        );
+    }
+    for file in files([99, 97, 96]) {
+        assert_eq!(decode(&file).unwrap().voxels[5 * 37 + 11], 97);
+    }
+
+    // A patch, so that subsampling does not average it away.
+    let patch = |color: [u8; 3]| {
+        let mut rgb = channels(&GrayImage::new(40, 40, vec![120; 1600]), 3);
+        for y in 8..24 {
+            for x in 8..24 {
+                rgb[3 * (y * 40 + x)..][..3].copy_from_slice(&color);
+            }
+        }
+        rgb
+    };
+    for subsamp in [turbojpeg::Subsamp::None, turbojpeg::Subsamp::Sub2x2] {
+        let error = decode(&rgb_jpeg(40, 40, &patch([180, 110, 60]), subsamp)).unwrap_err();
+        assert!(matches!(error, ImageError::Color { .. }), "{error}");
+        assert!(decode(&rgb_jpeg(40, 40, &patch([124, 120, 116]), subsamp)).is_ok());
+    }
+}
+
+/// A TIFF of one strip, written by hand: what the encoder does not write.
+fn raw_tiff(size: [u16; 2], bits: u16, tags: &[(u16, u16)], data: &[u8]) -> Vec<u8> {
+    let len = u16::try_from(data.len()).unwrap();
+    let [width, height] = size;
+    let mut entries = vec![
+        (256, width),
+        (257, height),
+        (258, bits),
+        (259, 1),
+        (273, 8),
+        (277, 1),
+        (278, height),
+        (279, len),
+    ];
+    entries.extend(tags);
+    entries.sort_unstable();
+    let mut file = b"II\x2a\0".to_vec();
+    file.extend((8 + u32::from(len)).to_le_bytes());
+    file.extend(data);
+    file.extend(u16::try_from(entries.len()).unwrap().to_le_bytes());
+    for (tag, value) in entries {
+        for half in [tag, 3, 1, 0, value, 0] {
+            file.extend(half.to_le_bytes());
+        }
+    }
+    file.extend([0; 4]);
+    file
+}
+
+const PHOTOMETRIC: u16 = 262;
+
+#[test]
+fn few_bits_are_spread_over_the_whole_range() {
     let bits = png_file(8, 1, ColorType::Grayscale, BitDepth::One, &[0b1010_0011]);
-    assert_eq!(
-        decode(&bits).unwrap().voxels,
-        [255, 0, 255, 0, 0, 0, 255, 255]
-    );
+    let want = [255, 0, 255, 0, 0, 0, 255, 255];
+    assert_eq!(decode(&bits).unwrap().voxels, want);
+
+    // Rows of five pixels do not fill their last byte.
+    let want_1 = [255, 0, 255, 0, 0, 0, 255, 255, 0, 255];
+    let want_2 = [0, 85, 170, 255, 85, 255, 170, 85, 0, 170];
+    let want_4 = [0, 17, 34, 51, 68, 255, 238, 221, 204, 187];
+    let cases: [(u16, BitDepth, &[u8], [u8; 10]); 3] = [
+        (1, BitDepth::One, &[0b1010_0111, 0b0110_1111], want_1),
+        (
+            2,
+            BitDepth::Two,
+            &[0b0001_1011, 0x7f, 0b1110_0100, 0xbf],
+            want_2,
+        ),
+        (
+            4,
+            BitDepth::Four,
+            &[0x01, 0x23, 0x4f, 0xfe, 0xdc, 0xbf],
+            want_4,
+        ),
+    ];
+    for (bits, depth, data, want) in cases {
+        let seen = decode(&raw_tiff([5, 2], bits, &[(PHOTOMETRIC, 1)], data));
+        assert_eq!(seen.unwrap().voxels, want, "TIFF of {bits} bits");
+        let seen = decode(&png_file(5, 2, ColorType::Grayscale, depth, data));
+        assert_eq!(seen.unwrap().voxels, want, "PNG of {bits} bits");
+        // White is zero: the other way round.
+        let seen = decode(&raw_tiff([5, 2], bits, &[(PHOTOMETRIC, 0)], data));
+        let turned = want.map(|v| 255 - v);
+        assert_eq!(seen.unwrap().voxels, turned, "white-is-zero of {bits} bits");
+    }
+}
+
+#[test]
+fn white_is_zero_shows_black_as_0() {
+    let image = texture(31, 17);
+    let turned: Vec<u8> = image.voxels.iter().map(|v| 255 - v).collect();
+    let turned = GrayImage::new(31, 17, turned);
+    let plain = raw_tiff([31, 17], 8, &[(PHOTOMETRIC, 0)], &turned.voxels);
+    assert!(decode(&plain).unwrap() == image);
+    // With every compression: the tag's value is all that changes.
+    for (what, mut file) in files(&turned).into_iter().take(5) {
+        let entry = file
+            .windows(8)
+            .position(|w| w == [6, 1, 3, 0, 1, 0, 0, 0])
+            .unwrap();
+        assert!(file[entry + 8] == 1, "{what} is written as black-is-zero");
+        file[entry + 8] = 0;
+        assert!(decode(&file).unwrap() == image, "{what}");
+    }
+}
+
+#[test]
+fn what_would_be_read_wrongly_is_refused() {
+    let pixels = [0, 50, 100, 150];
+    let sample_format = 339;
+    let fill_order = 266;
+    for (bits, tags, word) in [
+        (8, &[(PHOTOMETRIC, 3)][..], "palette"),
+        (8, &[(PHOTOMETRIC, 1), (sample_format, 2)], "signed"),
+        (8, &[(PHOTOMETRIC, 1), (fill_order, 2)], "reversed"),
+    ] {
+        let error = decode(&raw_tiff([2, 2], bits, tags, &pixels)).unwrap_err();
+        assert!(matches!(error, ImageError::Unsupported { .. }), "{error}");
+        let said = error.to_string();
+        assert!(said.contains(word) && said.contains("convert it"), "{said}");
+    }
+    let few = decode(&raw_tiff([2, 2], 6, &[(PHOTOMETRIC, 1)], &pixels)).unwrap_err();
+    assert!(matches!(few, ImageError::Depth { bits: 6 }), "{few:?}");
+
+    let mut twelve = jpeg_file(&texture(16, 16), false);
+    let frame = twelve.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
+    assert_eq!(std::mem::replace(&mut twelve[frame + 4], 12), 8);
+    let error = decode(&twelve).unwrap_err();
+    assert!(matches!(error, ImageError::Depth { bits: 12 }), "{error:?}");
 }
 
 /// Claims of gigapixels in a few bytes are refused before memory is set aside.
@@ -327,10 +548,15 @@ proptest! {
 
     #[test]
     fn damaged_files_never_panic(
-        kind in 0_usize..8,
+        kind in 0_usize..11,
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), any::<bool>()), 1..8),
     ) {
-        static FILES: LazyLock<Vec<(&str, Vec<u8>)>> = LazyLock::new(|| files(&texture(23, 29)));
+        static FILES: LazyLock<Vec<(&str, Vec<u8>)>> = LazyLock::new(|| {
+            let image = texture(23, 29);
+            let mut all = files(&image);
+            all.extend(unusual_files(&image));
+            all
+        });
         let (_, mut file) = FILES[kind].clone();
         for (at, value, at_ends) in changes {
             let at = at.index(file.len());

@@ -1,4 +1,6 @@
 //! TIFF files: strips or tiles; no compression, LZW, deflate, `PackBits` or JPEG.
+//!
+//! The decoder below turns white-is-zero round itself, whatever the bits; a test holds it to that.
 
 use std::io::{self, Cursor};
 
@@ -7,7 +9,7 @@ use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
 
 use super::sniff::{broken, incomplete};
-use super::{GrayImage, ImageError, allocate, check_size, luma};
+use super::{EXACT, GrayImage, ImageError, allocate, check_size, gray};
 
 pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
     check_header(bytes)?;
@@ -21,32 +23,74 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
         .with_limits(limits);
     let (width, height) = decoder.dimensions().map_err(sort)?;
     let pixels = check_size(width, height)?;
-    let channels = match decoder.colortype().map_err(sort)? {
-        ColorType::Gray(8) => 1,
-        ColorType::GrayA(8) => 2,
-        ColorType::RGB(8) => 3,
-        ColorType::RGBA(8) => 4,
+    check_samples(&mut decoder)?;
+    let (channels, bits) = match decoder.colortype().map_err(sort)? {
+        ColorType::Gray(bits @ (1 | 2 | 4 | 8)) => (1, bits),
+        ColorType::RGB(8) => (3, 8),
+        ColorType::RGBA(8) => (4, 8),
         ColorType::Gray(bits)
-        | ColorType::GrayA(bits)
         | ColorType::RGB(bits)
-        | ColorType::RGBA(bits) => return Err(ImageError::Depth { bits: bits.into() }),
-        other => {
-            return Err(ImageError::Unsupported {
-                what: format!("TIFF colours {other:?}"),
-            });
+        | ColorType::RGBA(bits)
+        | ColorType::Multiband {
+            bit_depth: bits @ 9..,
+            ..
+        } => return Err(ImageError::Depth { bits: bits.into() }),
+        ColorType::Multiband { num_samples, .. } => {
+            return Err(unsupported(format!("a TIFF of {num_samples} channels")));
         }
+        other => return Err(unsupported(format!("TIFF colours {other:?}"))),
     };
     check_data(&mut decoder, bytes.len() as u64)?;
     let layout = decoder.image_buffer_layout().map_err(sort)?;
-    if layout.len != pixels * channels || layout.complete_len != layout.len {
-        return Err(ImageError::Unsupported {
-            what: "a TIFF of several planes".to_owned(),
-        });
+    // Rows begin on whole bytes.
+    let row = (width as usize * channels * usize::from(bits)).div_ceil(8);
+    if layout.len != row * height as usize || layout.complete_len != layout.len {
+        return Err(unsupported("a TIFF of several planes"));
     }
     check_ratio(bytes.len(), layout.len)?;
-    let mut voxels = allocate(layout.len)?;
-    decoder.read_image_bytes(&mut voxels).map_err(sort)?;
-    Ok(GrayImage::new(width, height, luma(voxels, channels)))
+    let mut samples = allocate(layout.len)?;
+    decoder.read_image_bytes(&mut samples).map_err(sort)?;
+    if bits < 8 {
+        let voxels = spread(&samples, row, width as usize, bits, allocate(pixels)?);
+        return Ok(GrayImage::new(width, height, voxels));
+    }
+    gray((width, height), samples, channels, EXACT)
+}
+
+/// Samples of 1, 2 or 4 bits, the first in the highest bits, spread over 0 to 255, exactly.
+fn spread(packed: &[u8], row: usize, width: usize, bits: u8, mut voxels: Vec<u8>) -> Vec<u8> {
+    let per_byte = usize::from(8 / bits);
+    let most = u8::MAX >> (8 - bits);
+    for (packed, voxels) in packed.chunks_exact(row).zip(voxels.chunks_exact_mut(width)) {
+        for (x, voxel) in voxels.iter_mut().enumerate() {
+            let shift = (per_byte - 1 - x % per_byte) * usize::from(bits);
+            *voxel = ((packed[x / per_byte] >> shift) & most) * (u8::MAX / most);
+        }
+    }
+    voxels
+}
+
+/// Refuses what the decoder below would read as something else than it is, or not explain.
+fn check_samples(decoder: &mut Decoder<Cursor<&[u8]>>) -> Result<(), ImageError> {
+    let mut value = |tag| {
+        let values = decoder.find_tag_unsigned_vec::<u64>(tag).map_err(sort)?;
+        Ok::<_, ImageError>(values.and_then(|values| values.first().copied()))
+    };
+    if value(Tag::PhotometricInterpretation)? == Some(3) {
+        return Err(unsupported("a TIFF with a palette"));
+    }
+    // 1 is unsigned, 4 undefined.
+    if value(Tag::SampleFormat)?.is_some_and(|format| format != 1 && format != 4) {
+        return Err(unsupported("signed or floating-point numbers"));
+    }
+    if value(Tag::FillOrder)?.is_some_and(|order| order != 1) {
+        return Err(unsupported("a TIFF with the bits of its bytes reversed"));
+    }
+    Ok(())
+}
+
+fn unsupported(what: impl Into<String>) -> ImageError {
+    ImageError::Unsupported { what: what.into() }
 }
 
 /// Writers leave the place of the first directory empty until they know it.
@@ -111,9 +155,7 @@ fn sort(e: TiffError) -> ImageError {
         TiffError::IoError(e) if e.kind() == io::ErrorKind::UnexpectedEof => {
             incomplete("it ends early")
         }
-        TiffError::UnsupportedError(e) => ImageError::Unsupported {
-            what: e.to_string(),
-        },
+        TiffError::UnsupportedError(e) => unsupported(e.to_string()),
         e => broken(e),
     }
 }
