@@ -29,7 +29,7 @@ use std::time::SystemTime;
 
 use glam::{DVec3, UVec2, UVec3};
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{Volume, check_name};
 use saccade_core::voxel_box::VoxelBox;
 use serde::{Deserialize, Serialize};
 use sqlx::SqlitePool;
@@ -168,6 +168,8 @@ pub struct Statistics {
     pub quarantined: u64,
     /// Tiles whose file is not whole yet.
     pub waiting: u64,
+    /// Transforms whose tile has not come yet.
+    pub early: u64,
 }
 
 /// Where a tile lies in a volume of `extent` \[level-0 voxels\], cut at the volume's faces; `None`
@@ -268,7 +270,7 @@ impl Catalog {
     /// [`CatalogError::VolumeName`], [`CatalogError::WrongExtent`],
     /// [`CatalogError::WrongVoxelSize`], or what SQLite says.
     pub async fn create_volume(&self, volume: &Volume) -> Result<(), CatalogError> {
-        error::check_volume_name(&volume.name)?;
+        check_name(&volume.name)?;
         let description = serde_json::to_string(volume).expect("a volume becomes JSON");
         sqlx::query("INSERT INTO volumes (name, description) VALUES (?, ?) ON CONFLICT DO NOTHING")
             .bind(&volume.name)
@@ -586,8 +588,9 @@ impl Catalog {
         let entry = self.entry(volume).await?;
         let id = self.volume_id(volume).await?;
         let count = "SELECT (SELECT count(*) FROM quarantine WHERE volume = ?1), \
-                     (SELECT count(*) FROM waiting WHERE volume = ?1)";
-        let counts = sqlx::query_as::<_, (i64, i64)>(count).bind(id);
+                     (SELECT count(*) FROM waiting WHERE volume = ?1), \
+                     (SELECT count(*) FROM early_transforms WHERE volume = ?1)";
+        let counts = sqlx::query_as::<_, (i64, i64, i64)>(count).bind(id);
         let counts = counts
             .fetch_one(&self.inner.readers)
             .await
@@ -598,6 +601,7 @@ impl Catalog {
             sections: self.sections(volume).await?.len() as u64,
             quarantined: counts.0.unsigned_abs(),
             waiting: counts.1.unsigned_abs(),
+            early: counts.2.unsigned_abs(),
         })
     }
 

@@ -274,6 +274,8 @@ async fn a_commit_happens_whole_or_not_at_all() {
         commit.cursor(cursor).await.unwrap();
         commit.wait(&waiting).await.unwrap();
         commit.quarantine(&broken).await.unwrap();
+        let kept = commit.transform("later", at(1.0, 1.0), Some(3)).await;
+        assert_eq!(kept.unwrap(), TransformOutcome::Kept);
         commit
     };
     drop(fill().await);
@@ -293,6 +295,7 @@ async fn a_commit_happens_whole_or_not_at_all() {
         sections: 1,
         quarantined: 1,
         waiting: 1,
+        early: 1,
     };
     assert_eq!(catalog.statistics("v").await.unwrap(), want);
     assert_eq!(catalog.cursor("v").await.unwrap(), cursor);
@@ -470,7 +473,7 @@ async fn other_sizes_and_unknown_names_are_refused() {
     for name in ["", ".", "../v", "a/b", "a b", "ä", &"n".repeat(101)] {
         let refused = catalog.create_volume(&volume(name)).await;
         assert!(
-            matches!(refused, Err(CatalogError::VolumeName { .. })),
+            matches!(refused, Err(CatalogError::VolumeName(_))),
             "{name:?}"
         );
     }

@@ -51,10 +51,19 @@ pub struct Volume {
 #[non_exhaustive]
 pub enum VolumeError {
     /// An axis without voxels.
-    #[error("volume extent {extent} has an empty axis; give the size in voxels as x,y,z")]
+    #[error("the volume's extent is {extent}, but every axis needs at least 1 voxel")]
     Extent {
         /// As given \[voxels\].
         extent: UVec3,
+    },
+    /// The name cannot be used in addresses and file names.
+    #[error(
+        "{name:?} cannot name a volume: use 1 to 100 letters, digits, '-', '_' and '.', and do not \
+         begin with '.'"
+    )]
+    Name {
+        /// As asked for.
+        name: String,
     },
     /// A voxel size that is zero, negative or not a number.
     #[error("voxel size {voxel_nm} nm is not positive; give nanometres as x,y,z")]
@@ -62,6 +71,24 @@ pub enum VolumeError {
         /// As given \[nm\].
         voxel_nm: DVec3,
     },
+}
+
+/// Checks that a name can be used in addresses and file names: 1 to 100 ASCII letters, digits, `-`,
+/// `_` and `.`, the first not `.`. [`Volume::new`] does not: whoever takes a name in does.
+///
+/// # Errors
+///
+/// [`VolumeError::Name`].
+pub fn check_name(name: &str) -> Result<(), VolumeError> {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let good =
+        (1..=100).contains(&name.len()) && !name.starts_with('.') && name.chars().all(allowed);
+    if good {
+        Ok(())
+    } else {
+        let name = name.to_owned();
+        Err(VolumeError::Name { name })
+    }
 }
 
 impl Volume {
@@ -159,6 +186,19 @@ mod tests {
         assert!(Volume::new("v", UVec3::new(4, 0, 4), nm).is_err());
         assert!(Volume::new("v", UVec3::ONE, DVec3::new(1.0, -1.0, 1.0)).is_err());
         assert!(Volume::new("v", UVec3::ONE, DVec3::NAN).is_err());
+    }
+
+    #[test]
+    fn names_fit_addresses_and_files() {
+        let longest = "n".repeat(100);
+        for good in ["v", "fib25-medulla", "a.b_C-9", &longest] {
+            assert_eq!(check_name(good), Ok(()), "{good}");
+        }
+        let long = "n".repeat(101);
+        for bad in ["", ".", "..", ".v", "a b", "a/b", "a\\b", "µ", "a\n", &long] {
+            let refused = check_name(bad);
+            assert!(matches!(refused, Err(VolumeError::Name { .. })), "{bad:?}");
+        }
     }
 
     #[test]

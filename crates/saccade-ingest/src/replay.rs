@@ -23,9 +23,11 @@ use saccade_archive::acquisition::{
     AcquisitionError, AcquisitionInfo, Record, TileRecord, TransformRecord,
 };
 use saccade_archive::image::ImageError;
+use saccade_core::volume::check_name;
 
 use crate::simulate::archive::Archive;
 use crate::simulate::clock::{Clock, Pace};
+use crate::simulate::settings::Settings;
 use crate::simulate::stack::StackError;
 use crate::simulate::write::part_of;
 use crate::simulate::{SimulateError, SimulateSummary};
@@ -145,16 +147,8 @@ pub fn run(
     cancel: &Cancel,
     progress: &dyn Progress,
 ) -> Result<SimulateSummary, ReplayError> {
-    let info = AcquisitionInfo {
-        name: config
-            .name
-            .clone()
-            .unwrap_or_else(|| acquisition.name.clone()),
-        extent: acquisition.extent,
-        voxel_nm: config.voxel_nm,
-    };
-    crate::simulate::check_rate_and_voxel(config.rate_mpixel_s, config.voxel_nm)?;
-    let mut archive = Archive::open(folder, &info)?;
+    let (info, settings) = described(config, acquisition)?;
+    let mut archive = Archive::open(folder, &info, &settings)?;
     let mut pace = Pace::new(config.rate_mpixel_s);
     let mut summary = SimulateSummary::default();
     let mut meter = Meter::new();
@@ -165,6 +159,10 @@ pub fn run(
         .filter(|tile| !written(tile))
         .collect();
     let mut queued = todo.len() as u64;
+    progress.update(&State {
+        queued,
+        ..State::default()
+    });
     for tile in todo {
         let pixels = u64::from(tile.size.x) * u64::from(tile.size.y);
         let extension = tile
@@ -224,6 +222,36 @@ pub fn run(
     }
     summary.complete = true;
     Ok(summary)
+}
+
+/// Checks that [`run`] could begin, or go on, in the archive `folder`. Changes nothing.
+///
+/// # Errors
+///
+/// [`ReplayError`].
+pub fn check(
+    config: &ReplayConfig,
+    acquisition: &Acquisition,
+    folder: &Path,
+) -> Result<(), ReplayError> {
+    let (info, settings) = described(config, acquisition)?;
+    Archive::is_there(folder, &info, &settings)?;
+    Ok(())
+}
+
+fn described(
+    config: &ReplayConfig,
+    acquisition: &Acquisition,
+) -> Result<(AcquisitionInfo, Settings), SimulateError> {
+    let name = config.name.as_ref().unwrap_or(&acquisition.name);
+    check_name(name)?;
+    crate::simulate::check_rate_and_voxel(config.rate_mpixel_s, config.voxel_nm)?;
+    let info = AcquisitionInfo {
+        name: name.clone(),
+        extent: acquisition.extent,
+        voxel_nm: config.voxel_nm,
+    };
+    Ok((info, Settings::of_replay(&acquisition.identity())))
 }
 
 /// A second name for the image where the disk allows it, else a second image.

@@ -12,8 +12,9 @@
 //!
 //! # Failure
 //!
-//! Nothing is overwritten: an archive with the same settings is continued after the last tile
-//! recorded, one with other settings is refused. A tile is visible whole or not at all, and before its record.
+//! Nothing is overwritten: an archive that was simulated with the same settings, which
+//! `simulation.json` keeps beside `volume.json`, is continued after the last tile recorded. One of
+//! other settings is refused, and so is a microscope's. Rate and corrections may change. A tile is visible whole or not at all, and before its record.
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc;
@@ -22,11 +23,13 @@ use std::{fs, io};
 use glam::{DVec3, UVec2};
 use saccade_archive::acquisition::{AcquisitionError, Record, TileRecord, TransformRecord};
 use saccade_archive::image::GrayImage;
+use saccade_core::volume::VolumeError;
 
 pub(crate) mod archive;
 pub mod clock;
 mod cut;
 mod plan;
+pub(crate) mod settings;
 pub mod stack;
 pub(crate) mod write;
 
@@ -36,6 +39,7 @@ pub use plan::{Plan, PlannedTile};
 use crate::{Cancel, Meter, Progress, State};
 use archive::Archive;
 use clock::{Clock, Pace};
+use settings::Settings;
 use stack::{Stack, StackError};
 
 /// When the true transforms follow the stage's approximate ones.
@@ -110,6 +114,9 @@ pub enum SimulateError {
         /// What would make sense.
         must: &'static str,
     },
+    /// A name that no volume can have.
+    #[error(transparent)]
+    Name(#[from] VolumeError),
     /// The stack could not be read.
     #[error("the stack cannot be read")]
     Stack {
@@ -134,14 +141,23 @@ pub enum SimulateError {
     },
     /// The folder holds another acquisition.
     #[error(
-        "the folder holds another acquisition ({found}, wanted {wanted}); choose an empty folder: {}",
+        "the folder holds another acquisition: {differences}. Give the same options to go on with \
+         it, or choose an empty folder: {}",
         path.display()
     )]
     OtherArchive {
-        /// What is there.
-        found: String,
-        /// What was to be written.
-        wanted: String,
+        /// Which settings differ, and how.
+        differences: String,
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The folder holds what a microscope wrote.
+    #[error(
+        "the folder holds an acquisition that was not simulated (it has no readable {}), and other \
+         tiles do not belong into it; choose an empty folder: {}",
+        Settings::FILE, path.display()
+    )]
+    NotSimulated {
         /// The folder.
         path: PathBuf,
     },
@@ -176,7 +192,8 @@ pub fn run(
     progress: &dyn Progress,
 ) -> Result<SimulateSummary, SimulateError> {
     let plan = Plan::new(config, stack.info())?;
-    let archive = Archive::open(folder, plan.info())?;
+    let settings = Settings::of_simulation(config, &stack.identity());
+    let archive = Archive::open(folder, plan.info(), &settings)?;
     let sections = plan.sections();
     let skip = archive.written.clone();
     // One thread cuts, this one writes and waits; at most one finished tile lies between them.
@@ -212,6 +229,21 @@ pub fn run(
         run.summary.complete = run.follow(config.corrections, plan, sections, receive)?;
         Ok(run.summary)
     })
+}
+
+/// Checks that [`run`] could begin, or go on, in the archive `folder`. Changes nothing.
+///
+/// # Errors
+///
+/// [`SimulateError`].
+pub fn check(
+    config: &SimulateConfig,
+    stack: &dyn Stack,
+    folder: &Path,
+) -> Result<(), SimulateError> {
+    let plan = Plan::new(config, stack.info())?;
+    let settings = Settings::of_simulation(config, &stack.identity());
+    Archive::is_there(folder, plan.info(), &settings).map(|_| ())
 }
 
 type CutTile = (PlannedTile, Result<GrayImage, StackError>);

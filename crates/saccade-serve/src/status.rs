@@ -17,6 +17,8 @@ pub struct Status {
     pub sections: Option<u64>,
     /// Tiles that are announced but whose files are not whole yet; `None` likewise.
     pub waiting: Option<u64>,
+    /// Transforms whose tile has not come yet; `None` likewise.
+    pub early_transforms: Option<u64>,
     /// Files that could not be taken in.
     pub quarantined: Vec<Quarantined>,
 }
@@ -26,6 +28,8 @@ pub struct Status {
 pub struct Quarantined {
     /// As the acquisition names it.
     pub file: String,
+    /// The tile it was to become, if known.
+    pub tile: Option<String>,
     /// Why, in words for people.
     pub reason: String,
 }
@@ -71,6 +75,7 @@ impl CatalogStatus {
         let quarantined = self.catalog.quarantined(&self.volume).await?;
         let file = |q: saccade_archive::catalog::Quarantined| Quarantined {
             file: q.file,
+            tile: q.tile,
             reason: q.reason,
         };
         Ok(Status {
@@ -78,6 +83,7 @@ impl CatalogStatus {
             tiles: Some(statistics.tiles),
             sections: Some(statistics.sections),
             waiting: Some(statistics.waiting),
+            early_transforms: Some(statistics.early),
             quarantined: quarantined.into_iter().map(file).collect(),
         })
     }

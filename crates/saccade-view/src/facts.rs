@@ -355,6 +355,7 @@ mod tests {
     fn files_set_aside_are_counted_and_explained() {
         let file = |n| Quarantined {
             file: format!("t{n}.tif"),
+            tile: None,
             reason: "16 bit".to_owned(),
         };
         let acquisition = Acquisition {

@@ -97,6 +97,7 @@ impl Place {
 fn told(status: saccade_serve::Status) -> Status {
     let file = |q: saccade_serve::Quarantined| Quarantined {
         file: q.file,
+        tile: q.tile,
         reason: q.reason,
     };
     Status {

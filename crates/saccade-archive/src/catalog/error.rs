@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use glam::{DVec3, UVec3};
+use saccade_core::volume::VolumeError;
 
 /// Why the catalog could not do what was asked.
 #[derive(Debug, thiserror::Error)]
@@ -80,14 +81,8 @@ pub enum CatalogError {
         known: Vec<String>,
     },
     /// The name cannot be used in addresses and file names.
-    #[error(
-        "{name:?} cannot name a volume: use 1 to 100 letters, digits, '-', '_' and '.', and do not \
-         begin with '.'"
-    )]
-    VolumeName {
-        /// As asked for.
-        name: String,
-    },
+    #[error(transparent)]
+    VolumeName(#[from] VolumeError),
     /// A volume of that name has another size.
     #[error(
         "wrong extent: volume {name:?} has {existing} voxels in the catalog, but {asked} now; give \
@@ -191,18 +186,5 @@ fn list(names: &[String]) -> String {
         "none yet".to_owned()
     } else {
         names.join(", ")
-    }
-}
-
-pub(super) fn check_volume_name(name: &str) -> Result<(), CatalogError> {
-    let allowed = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
-    let good =
-        (1..=100).contains(&name.len()) && !name.starts_with('.') && name.chars().all(allowed);
-    if good {
-        Ok(())
-    } else {
-        Err(CatalogError::VolumeName {
-            name: name.to_owned(),
-        })
     }
 }

@@ -90,6 +90,14 @@ impl Context<'_> {
         let (section, size, transform) = (record.section, record.size, record.transform);
         let before = look(&path);
         let bytes = before.map(|l| l.bytes);
+        if size.min_element() == 0 {
+            let reason = format!(
+                "the record says {} x {} pixels, but the size must be at least 1 x 1 pixels; append \
+                 the record again with the size of its image",
+                size.x, size.y,
+            );
+            return Ok(quarantine(&record, reason, bytes, None));
+        }
         if place(self.extent, section, size, transform).is_none() {
             let reason = format!(
                 "the tile lies wholly outside the volume of {} voxels (section {section}, transform \

@@ -14,6 +14,7 @@ use saccade_archive::acquisition::{
     AcquisitionError, AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
 };
 use saccade_archive::catalog::{CatalogError, Quarantined, TileOutcome, TransformOutcome};
+use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 
 use super::prepare::{Backoff, Context, Outcome};
@@ -40,6 +41,8 @@ pub struct Summary {
     pub moved: u64,
     /// Files and records put in quarantine.
     pub quarantined: u64,
+    /// Transforms that wait for a tile that has not come, also those of earlier runs.
+    pub early: u64,
 }
 
 /// Ingests an acquisition archive, until cancelled or, with `once`, until all that is there is done.
@@ -59,12 +62,15 @@ pub async fn run(
     cancel: &Cancel,
 ) -> Result<Summary, IngestError> {
     let info = AcquisitionInfo::read(acquisition)?;
-    let mut volume = info.volume().map_err(|source| IngestError::Volume {
+    let impossible = |source| IngestError::Volume {
         source,
         path: acquisition.join(AcquisitionInfo::FILE),
-    })?;
-    if let Some(name) = &options.volume {
-        volume.name.clone_from(name);
+    };
+    let mut volume = info.volume().map_err(impossible)?;
+    match &options.volume {
+        // The catalog looks at it; the file is not to blame.
+        Some(name) => volume.name.clone_from(name),
+        None => check_name(&volume.name).map_err(impossible)?,
     }
     archive.catalog().create_volume(&volume).await?;
     let _lock = lock(archive, &volume.name)?;
@@ -98,6 +104,7 @@ pub async fn run(
             Either::Right(_) => {}
         }
     }
+    ingest.summary.early = catalog.statistics(&volume.name).await?.early;
     Ok(ingest.summary)
 }
 

@@ -1,7 +1,7 @@
 //! A microscope's tiles in one frame: where the stage said, and where registration says.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
@@ -13,6 +13,7 @@ use saccade_core::transform::{SectionFromTile, TilePoint};
 use tiff::decoder::Decoder;
 
 use super::ReplayError;
+use crate::simulate::settings::Fingerprint;
 use crate::simulate::stack::volume_name;
 
 /// A tile as it came from the microscope.
@@ -123,6 +124,30 @@ impl Acquisition {
             extent,
             tiles,
         })
+    }
+}
+
+impl Acquisition {
+    /// Which acquisition it is: the same for the same tiles, wherever they lie, and another for
+    /// others, or for another solution.
+    pub(super) fn identity(&self) -> String {
+        let mut fingerprint = Fingerprint::new();
+        for tile in &self.tiles {
+            // A zero byte ends the name, so that no two lists of tiles make the same bytes.
+            fingerprint.add(tile.name.as_bytes());
+            fingerprint.add(&[0, u8::from(tile.aligned.is_some())]);
+            for number in [tile.section, tile.size.x, tile.size.y] {
+                fingerprint.add(&number.to_le_bytes());
+            }
+            let bytes = fs::metadata(&tile.image).map_or(0, |meta| meta.len());
+            fingerprint.add(&bytes.to_le_bytes());
+            for transform in [Some(tile.stage), tile.aligned].into_iter().flatten() {
+                for element in transform.elements() {
+                    fingerprint.add(&element.to_le_bytes());
+                }
+            }
+        }
+        format!("acquisition {fingerprint}")
     }
 }
 

@@ -10,7 +10,7 @@ use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
 
 use super::acquisition::median_offset;
 use super::{Acquisition, ReplayError};
-use crate::simulate::stack::{self, Stack};
+use crate::simulate::stack::{self, Stack, volume_name};
 
 /// A text file larger than this is no tile list \[bytes\].
 const LARGEST_LIST: u64 = 256 << 20;
@@ -23,6 +23,8 @@ pub enum Input {
         stack: Box<dyn Stack>,
         /// Where it is: the folder or file itself, or one below.
         path: PathBuf,
+        /// A name for the volume, from what was pointed at, wherever below the sections lie.
+        name: String,
     },
     /// A real acquisition, for [`super::run`].
     Acquisition(Acquisition),
@@ -38,7 +40,7 @@ impl Input {
     /// One line for people: what was found, and which files were chosen.
     pub fn describe(&self) -> String {
         match self {
-            Self::Stack { stack, path } => {
+            Self::Stack { stack, path, .. } => {
                 let extent = stack.info().extent;
                 format!(
                     "a stack of {} x {} x {} voxels: {}",
@@ -81,6 +83,7 @@ pub fn detect(path: &Path) -> Result<Input, ReplayError> {
         return Ok(Input::Stack {
             stack,
             path: path.to_owned(),
+            name: volume_name(path),
         });
     }
     if path.join(AcquisitionInfo::FILE).is_file() {
@@ -257,6 +260,7 @@ fn find_stack(path: &Path, tree: &Tree) -> Result<Input, ReplayError> {
                 return Ok(Input::Stack {
                     stack,
                     path: folder.clone(),
+                    name: volume_name(path),
                 });
             }
             Err(error) => _ = first_error.get_or_insert(error),

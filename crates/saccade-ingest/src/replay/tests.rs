@@ -208,6 +208,25 @@ fn a_replay_goes_on_where_it_was_and_ends_with_the_solution() {
         (again.tiles, again.corrections, again.complete),
         (0, 0, true)
     );
+
+    // Another acquisition, though of the same size, does not go on here; the same one, elsewhere, does.
+    check(&config, &acquisition, folder.path()).unwrap();
+    let mut other = acquisition.clone();
+    other.tiles[1].stage = other.tiles[1].stage.shifted(DVec2::X);
+    let refused = check(&config, &other, folder.path()).unwrap_err();
+    let said = std::error::Error::source(&refused).unwrap().to_string();
+    assert!(said.contains("input is acquisition "), "{said}");
+    let moved = tempfile::tempdir().unwrap();
+    let mut elsewhere = acquisition.clone();
+    for tile in &mut elsewhere.tiles {
+        let image = moved.path().join(tile.image.file_name().unwrap());
+        fs::copy(&tile.image, &image).unwrap();
+        tile.image = image;
+    }
+    check(&config, &elsewhere, folder.path()).unwrap();
+    let name = Some("no/name".to_owned());
+    let named = ReplayConfig { name, ..config };
+    assert!(check(&named, &acquisition, folder.path()).is_err());
 }
 
 #[test]
@@ -248,16 +267,22 @@ fn of_several_folders_the_raw_images_are_the_stack() {
             );
         }
     }
-    let Input::Stack { stack, path } = detect(folder.path()).unwrap() else {
+    let inner = folder.path().join("cortex 7");
+    fs::create_dir(&inner).unwrap();
+    for name in ["labels", "other", "raw"] {
+        fs::rename(folder.path().join(name), inner.join(name)).unwrap();
+    }
+    let Input::Stack { stack, path, name } = detect(&inner).unwrap() else {
         panic!("it is a stack")
     };
-    assert_eq!(path, folder.path().join("raw"));
+    assert_eq!(name, "cortex-7", "as the user calls it, not as its inside");
+    assert_eq!(path, inner.join("raw"));
     assert_eq!(stack.info().extent, UVec3::new(9, 7, 2));
-    fs::remove_dir_all(folder.path().join("raw")).unwrap();
-    let Input::Stack { path, .. } = detect(folder.path()).unwrap() else {
+    fs::remove_dir_all(inner.join("raw")).unwrap();
+    let Input::Stack { path, .. } = detect(&inner).unwrap() else {
         panic!("it is a stack")
     };
-    assert_eq!(path, folder.path().join("other"));
+    assert_eq!(path, inner.join("other"));
 }
 
 /// Real data beside the workspace, or a message that it is missing.
@@ -284,9 +309,11 @@ fn real_stacks_are_found() {
         ("vnc-sstem/stack1", "raw", UVec3::new(1024, 1024, 20)),
     ] {
         let Some(folder) = shared(folder) else { return };
-        let Input::Stack { stack, path } = detect(&folder).unwrap() else {
+        let Input::Stack { stack, path, name } = detect(&folder).unwrap() else {
             panic!("{} is a stack", folder.display())
         };
+        let leaf = folder.file_name().unwrap().to_str().unwrap();
+        assert_eq!(name, leaf, "as the user calls it");
         assert_eq!(path, folder.join(inside));
         assert_eq!(stack.info().extent, extent);
         let last = stack

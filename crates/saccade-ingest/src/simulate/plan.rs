@@ -10,6 +10,7 @@ use std::f64::consts::TAU;
 use glam::{DVec2, UVec2, UVec3};
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::check_name;
 
 use super::stack::StackInfo;
 use super::{SimulateConfig, SimulateError};
@@ -53,7 +54,7 @@ impl Plan {
     ///
     /// # Errors
     ///
-    /// [`SimulateError::Setting`].
+    /// [`SimulateError::Setting`], [`SimulateError::Name`].
     pub fn new(config: &SimulateConfig, stack: &StackInfo) -> Result<Self, SimulateError> {
         let wrong = |setting, value: &dyn std::fmt::Display, must| {
             Err(SimulateError::Setting {
@@ -87,6 +88,7 @@ impl Plan {
             .unwrap_or_else(|| stack.voxel_nm_or_assumed());
         super::check_rate_and_voxel(config.rate_mpixel_s, voxel_nm)?;
         let name = config.name.clone().unwrap_or_else(|| stack.name.clone());
+        check_name(&name)?;
         let size = config.tile.as_dvec2();
         let overlap = size * config.overlap;
         // A pixel stays in reserve on each side, so that rounding never uncovers a voxel.

@@ -19,6 +19,8 @@ pub use zarr::{Window, ZarrStack};
 
 pub(crate) use files::volume_name;
 
+use super::settings::Fingerprint;
+
 /// Whatever else can go wrong in a library.
 pub type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
@@ -60,6 +62,22 @@ pub trait Stack: Send + Sync {
     ///
     /// [`StackError`]; [`StackError::Outside`] for what the stack does not hold.
     fn region(&self, section: u32, min: UVec2, size: UVec2) -> Result<GrayImage, StackError>;
+
+    /// Which tissue it is: the same for the same stack, wherever it lies, and another for another.
+    /// By default a fingerprint of the middle of two sections.
+    fn identity(&self) -> String {
+        let extent = self.info().extent;
+        let size = extent.truncate().min(UVec2::splat(64));
+        let min = (extent.truncate() - size) / 2;
+        let mut fingerprint = Fingerprint::new();
+        for section in [extent.z / 2, 0] {
+            // Whoever cuts the section will say what is wrong with it.
+            if let Ok(image) = self.region(section, min, size) {
+                fingerprint.add(&image.voxels);
+            }
+        }
+        format!("stack {fingerprint}")
+    }
 }
 
 /// Why a stack, or a section of it, could not be read.

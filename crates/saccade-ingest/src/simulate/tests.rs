@@ -250,7 +250,8 @@ fn archives_depend_on_the_settings_alone() {
     let quiet = contents(acquire(&config()).0.path());
     assert_eq!(
         quiet.len() as u64,
-        2 + Plan::new(&config(), stack().info()).unwrap().tile_count()
+        // Beside the tiles: the description, the settings, the records.
+        3 + Plan::new(&config(), stack().info()).unwrap().tile_count()
     );
 
     let paced = SimulateConfig {
@@ -474,6 +475,120 @@ fn corrections_tell_the_truth_when_asked_to() {
     }
 }
 
+/// An archive goes on only with what made it.
+#[test]
+fn other_settings_do_not_go_on() {
+    let (folder, _) = acquire(&config());
+    let path = folder.path();
+    let before = contents(path);
+    let attempt = |config: &SimulateConfig, stack: &dyn Stack| {
+        let clock = PretendClock::default();
+        let checked = check(config, stack, path).map_err(|error| error.to_string());
+        let ran = run(config, stack, path, &clock, &Cancel::new(), &());
+        let ran = ran.map(|_| ()).map_err(|error| error.to_string());
+        assert_eq!(checked, ran, "the check says what would happen");
+        ran
+    };
+    let say = |config: SimulateConfig| attempt(&config, &stack()).unwrap_err();
+    let with = config;
+    for (config, words) in [
+        (
+            SimulateConfig { seed: 2, ..with() },
+            "seed is 1 there, 2 now",
+        ),
+        (
+            SimulateConfig {
+                overlap: 0.2,
+                ..with()
+            },
+            "overlap is 0.15 there, 0.2 now",
+        ),
+        (
+            SimulateConfig {
+                jitter_px: 3.5,
+                ..with()
+            },
+            "jitter is 24.0 there, 3.5 now",
+        ),
+        (
+            SimulateConfig {
+                rotation_deg: 0.0,
+                ..with()
+            },
+            "rotation is 3.0 there, 0.0 now",
+        ),
+        (
+            SimulateConfig {
+                stage_error_px: 2.0,
+                ..with()
+            },
+            "stage-error is 0.0 there, 2.0 now",
+        ),
+        (
+            SimulateConfig {
+                shuffle: true,
+                ..with()
+            },
+            "shuffle is false there, true now",
+        ),
+        (
+            SimulateConfig {
+                tile: UVec2::splat(64),
+                ..with()
+            },
+            "tile is 75 x 64 there, 64 x 64 now",
+        ),
+        (
+            SimulateConfig {
+                name: Some("w".into()),
+                ..with()
+            },
+            "name is phantom there, w now",
+        ),
+        (
+            SimulateConfig {
+                voxel_nm: Some(DVec3::splat(5.0)),
+                ..with()
+            },
+            "voxel-nm is 8 x 8 x 40 there, 5 x 5 x 5 now",
+        ),
+    ] {
+        let said = say(config);
+        assert!(said.contains(words), "{words:?} is not in: {said}");
+        assert_eq!(said.matches(" there, ").count(), 1, "{said}");
+    }
+    let larger = PhantomStack::new(7, EXTENT + 1, DVec3::new(8.0, 8.0, 40.0)).unwrap();
+    let said = attempt(&config(), &larger).unwrap_err();
+    assert!(
+        said.contains("extent is 190 x 171 x 3 there, 191 x 172 x 4 now"),
+        "{said}"
+    );
+
+    let allowed = SimulateConfig {
+        rate_mpixel_s: Some(1.0),
+        corrections: Corrections::AtEnd,
+        ..config()
+    };
+    check(&allowed, &stack(), path).unwrap();
+    assert!(
+        contents(path) == before,
+        "refused runs and checks write nothing"
+    );
+
+    // A microscope's archive, and one whose description somebody broke.
+    fs::remove_file(path.join(Settings::FILE)).unwrap();
+    assert!(say(config()).contains("was not simulated"));
+    fs::remove_file(path.join(AcquisitionInfo::FILE)).unwrap();
+    assert!(
+        say(config()).contains("was not simulated"),
+        "its records are there"
+    );
+    fs::write(path.join(AcquisitionInfo::FILE), "{}").unwrap();
+    let broken = check(&config(), &stack(), path).unwrap_err();
+    assert!(matches!(broken, SimulateError::Archive { .. }), "{broken}");
+    assert_eq!(fs::read(path.join(AcquisitionInfo::FILE)).unwrap(), b"{}");
+}
+
 #[test]
 fn bad_settings_and_folders_are_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -535,10 +650,14 @@ fn bad_settings_and_folders_are_refused() {
     .unwrap();
     let refused = attempt(&config(), path);
     assert!(
-        matches!(&refused, SimulateError::OtherArchive { .. }),
+        matches!(&refused, SimulateError::NotSimulated { .. }),
         "{refused}"
     );
     assert!(refused.to_string().ends_with(&path.display().to_string()));
+
+    let name = Some("a b".to_owned());
+    let named = attempt(&SimulateConfig { name, ..config() }, path);
+    assert!(matches!(named, SimulateError::Name(_)), "{named}");
 
     let file = path.join("file");
     fs::write(&file, "").unwrap();

@@ -10,7 +10,7 @@ use saccade_ingest::ingest::run;
 
 use crate::scope::{
     Diary, EXTENT, Scope, VOLUME, archive, at, move_record, orphans, pixels, quick, seen, texture,
-    tiff16, tile_record,
+    tiff_rgb, tiff16, tile_record,
 };
 
 const SIZE: UVec2 = UVec2::new(140, 130);
@@ -74,6 +74,33 @@ async fn a_16_bit_tile() {
     );
     assert_eq!(what.bytes, Some(len));
     says(&what, &["16", "8"]);
+}
+
+#[tokio::test]
+async fn a_coloured_tile() {
+    let what = refused(|scope| {
+        fs::write(scope.file("red"), tiff_rgb(SIZE, [200, 30, 30])).unwrap();
+        scope.say(&tile_record("red", 0, SIZE));
+    })
+    .await;
+    assert_eq!(what.tile.as_deref(), Some("red"));
+    says(
+        &what,
+        &["in colour", "[200, 30, 30]", "pixel 0, 0", "convert"],
+    );
+}
+
+#[tokio::test]
+async fn a_tile_without_pixels() {
+    for size in [UVec2::ZERO, UVec2::new(140, 0)] {
+        let what = refused(|scope| {
+            scope.image("flat", SIZE, 3);
+            scope.say(&tile_record("flat", 0, size));
+        })
+        .await;
+        assert_eq!(what.tile.as_deref(), Some("flat"));
+        says(&what, &["size must be at least 1 x 1 pixels"]);
+    }
 }
 
 #[tokio::test]

@@ -248,3 +248,14 @@ impl Progress for Diary {
         self.notices.lock().unwrap().push(text.to_owned());
     }
 }
+
+/// A TIFF of one colour.
+pub(crate) fn tiff_rgb(size: UVec2, color: [u8; 3]) -> Vec<u8> {
+    let mut file = std::io::Cursor::new(Vec::new());
+    let data = color.repeat((size.x * size.y) as usize);
+    TiffEncoder::new(&mut file)
+        .unwrap()
+        .write_image::<colortype::RGB8>(size.x, size.y, &data)
+        .unwrap();
+    file.into_inner()
+}

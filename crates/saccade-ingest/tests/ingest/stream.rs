@@ -45,7 +45,8 @@ async fn pixels_arrive_as_they_left() {
             tiles: 4,
             pixels: count,
             moved: 0,
-            quarantined: 0
+            quarantined: 0,
+            early: 0,
         }
     );
     let tiles = seen(&archive).await;
@@ -141,10 +142,11 @@ async fn transforms_come_early_and_late() {
     scope.say(&move_record("early", at(100.0, 100.0)));
     scope.tile("early", 0, SIZE, 1);
     scope.tile("late", 0, SIZE, 2);
-    scope.ingest(&archive).await;
+    scope.say(&move_record("never", at(1.0, 1.0)));
+    assert_eq!(scope.ingest(&archive).await.early, 1);
     scope.say(&move_record("late", at(200.0, 200.0)));
     let summary = scope.ingest(&archive).await;
-    assert_eq!((summary.tiles, summary.moved), (0, 1));
+    assert_eq!((summary.tiles, summary.moved, summary.early), (0, 1, 1));
     let tiles = seen(&archive).await;
     assert_eq!(tiles["early"].transform, at(100.0, 100.0).elements());
     assert_eq!(tiles["late"].transform, at(200.0, 200.0).elements());

@@ -21,6 +21,8 @@ pub struct Status {
 pub struct Quarantined {
     /// As the acquisition names it.
     pub file: String,
+    /// The tile it was to become, if known.
+    pub tile: Option<String>,
     /// Why, in words for people.
     pub reason: String,
 }

@@ -20,6 +20,9 @@ pub fn check(stack: &dyn Stack, extent: UVec3, values: &[u8]) {
         info.name
     );
 
+    let identity = stack.identity();
+    assert!(!identity.is_empty(), "a stack can be told from others");
+
     let want = |section: u32, min: UVec2, size: UVec2| -> Vec<u8> {
         let mut want = Vec::new();
         for y in min.y..min.y + size.y {
@@ -68,4 +71,5 @@ pub fn check(stack: &dyn Stack, extent: UVec3, values: &[u8]) {
         assert!(outside, "section {section} at {min}, {size} is outside");
     }
     assert_eq!(*stack.info(), info, "the description never changes");
+    assert_eq!(stack.identity(), identity, "it stays the same stack");
 }

@@ -49,6 +49,11 @@ impl Stack for PhantomStack {
         &self.info
     }
 
+    /// The rest of what makes it are settings.
+    fn identity(&self) -> String {
+        "phantom".to_owned()
+    }
+
     fn region(&self, section: u32, min: UVec2, size: UVec2) -> Result<GrayImage, StackError> {
         check_inside(&self.info, section, min, size)?;
         let width = size.x as usize;
