@@ -1,6 +1,9 @@
 //! Values on the command line.
 
+use std::path::PathBuf;
+
 use glam::{DVec3, UVec2, UVec3};
+use saccade_core::volume::check_name;
 
 /// Three whole numbers above 0, as `x,y,z`.
 pub(crate) fn extent(text: &str) -> Result<UVec3, String> {
@@ -47,6 +50,27 @@ pub(crate) fn picture_size(text: &str) -> Result<UVec2, String> {
         return Err(format!("a side has {LONGEST_SIDE} pixels at most"));
     }
     Ok(size)
+}
+
+/// A name that a volume can have.
+pub(crate) fn volume_name(text: &str) -> Result<String, String> {
+    match check_name(text) {
+        Ok(()) => Ok(text.to_owned()),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+/// The file of a picture.
+pub(crate) fn picture(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let png = path
+        .extension()
+        .is_none_or(|extension| extension.eq_ignore_ascii_case("png"));
+    if png {
+        Ok(path)
+    } else {
+        Err("pictures are PNG only: name it .png".into())
+    }
 }
 
 /// A time in seconds.
@@ -106,6 +130,11 @@ mod tests {
             assert!(extent(bad).is_err(), "{bad}");
         }
         assert!(picture_size("16384x1").is_ok() && picture_size("1x16385").is_err());
+        assert!(volume_name("fib25-medulla").is_ok() && volume_name("fib 25").is_err());
+        assert!(picture("a/b.PNG").is_ok() && picture("/dev/stdout").is_ok());
+        for bad in ["a.jpg", "b.png.tif"] {
+            assert!(picture(bad).unwrap_err().contains(".png"), "{bad}");
+        }
         assert!(size("0x4").is_err() && size("64").is_err() && size("64x64x64").is_err());
         assert!(voxel_nm("4,4,0").is_err() && voxel_nm("4,nan,4").is_err());
         assert!(rate("0").is_err() && rate("-1").is_err() && rate("fast").is_err());

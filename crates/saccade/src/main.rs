@@ -64,3 +64,36 @@ fn main() -> ExitCode {
         Err(error) => report::failed(&error),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::CommandLine;
+
+    /// Nobody should have to try what happens without an option.
+    #[test]
+    fn every_default_is_told() {
+        let mut all = CommandLine::command();
+        all.build();
+        let mut seen = 0;
+        for command in all.get_subcommands() {
+            for option in command
+                .get_opts()
+                .filter(|option| !option.is_required_set())
+            {
+                let (command, id) = (command.get_name(), option.get_id());
+                let help = option
+                    .get_help()
+                    .map(ToString::to_string)
+                    .unwrap_or_default();
+                let told = help.contains("[default: ") || !option.get_default_values().is_empty();
+                // `simulate` wants to be told either.
+                let wanted = (command, id.as_str()) == ("simulate", "input");
+                assert!(told || wanted, "{command} --{id}: {help}");
+                seen += 1;
+            }
+        }
+        assert!(seen > 20, "only {seen} options");
+    }
+}

@@ -30,7 +30,7 @@ use crate::report::{say, tell};
 #[derive(Args)]
 pub(crate) struct Demo {
     /// Real data instead of the phantom: a registered stack, or an acquisition as it came from the
-    /// microscope
+    /// microscope [default: the phantom]
     #[arg(long, value_name = "DIR")]
     input: Option<PathBuf>,
 
@@ -43,7 +43,7 @@ pub(crate) struct Demo {
     #[command(flatten)]
     at: At,
 
-    /// Keep what is made in this folder, or go on with what is there
+    /// Keep what is made in this folder, or go on with what is there [default: a temporary folder]
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
 
@@ -55,19 +55,36 @@ pub(crate) struct Demo {
     #[arg(long)]
     once: bool,
 
-    /// End after this time [s]
+    /// End after this time [s] [default: at Ctrl-C]
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     duration: Option<Duration>,
 }
 
-/// How long the acquisition takes, unless a rate is asked for [s].
+/// How long the acquisition takes at most, unless a rate is asked for [s].
 const SHOW: f64 = 90.0;
+
+/// Fewer tiles than this would look stuck [1/s].
+const TILES_PER_S: f64 = 4.0;
+
+/// The edge of tiles that are many to a section, but not tiny [pixels].
+fn tile_edge(section: UVec2) -> u32 {
+    let longest = section.max_element();
+    let fits = |edge: &u32| longest >= edge + edge / 2;
+    [512, 256, 128, 64].into_iter().find(fits).unwrap_or(32)
+}
+
+/// A rate at which so many tiles keep coming and are soon in [Mpixel/s].
+fn show_rate(tiles: u64, mpixel: f64) -> f64 {
+    mpixel / (tiles as f64 / TILES_PER_S).min(SHOW)
+}
 
 impl Demo {
     pub(crate) async fn run(self) -> Result<()> {
         let server = Server::bind(self.at.address()).await?;
         let subject = self.subject()?;
         let work = Work::new(self.work.as_deref())?;
+        // Before anything is shown: what is there may be something else.
+        subject.check(&work.acquisition())?;
         let stop = cancel_when_interrupted();
         if let Some(duration) = self.duration {
             let stop = stop.clone();
@@ -84,21 +101,17 @@ impl Demo {
         done
     }
 
-    /// What is acquired, in tiles that are many but not tiny, over a minute or two.
+    /// What is acquired, in tiles and at a pace that are worth watching.
     fn subject(&self) -> Result<Subject> {
-        let other = SimulateConfig {
-            tile: UVec2::splat(512),
-            ..SimulateConfig::default()
-        };
+        let other = SimulateConfig::default();
         let mut subject = self.microscope.subject(self.input.as_deref(), other)?;
         if let Subject::Tissue { stack, config } = &mut subject
-            && stack.info().extent.truncate().max_element() < 768
             && !self.microscope.has_tile()
         {
-            config.tile = UVec2::splat(128);
+            config.tile = UVec2::splat(tile_edge(stack.info().extent.truncate()));
         }
         if !self.microscope.has_rate() {
-            subject.set_rate(Some(subject.mpixel()? / SHOW));
+            subject.set_rate(Some(show_rate(subject.tiles()?, subject.mpixel()?)));
         }
         Ok(subject)
     }
@@ -130,7 +143,9 @@ impl Demo {
             open_browser(&url);
         }
 
-        let shown = Shown::new("demo", Some(total));
+        // What earlier runs took in does not come again.
+        let before = archive.catalog().entry(&info.name).await?.tiles;
+        let shown = Shown::new("demo", Some(total.saturating_sub(before)));
         let working = async {
             let following = IngestOptions {
                 encoding: self.stored.encoding(),
@@ -230,5 +245,62 @@ fn open_browser(url: &str) {
         .spawn();
     if let Err(error) = silent {
         log::info!("no browser could be opened: {opener}: {error}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::UVec3;
+    use saccade_ingest::simulate::Plan;
+    use saccade_ingest::simulate::stack::StackInfo;
+
+    use super::*;
+
+    #[test]
+    fn tiles_are_many_but_not_tiny() {
+        for (section, want) in [
+            ((21_494, 25_790), 512),
+            ((1024, 1024), 512),
+            ((700, 768), 512),
+            ((767, 767), 256),
+            ((250, 250), 128),
+            ((200, 150), 128),
+            ((100, 90), 64),
+            ((1, 1), 32),
+        ] {
+            assert_eq!(tile_edge(section.into()), want, "{section:?}");
+        }
+    }
+
+    /// Whatever the volume: soon something to see, and never a long wait between two tiles.
+    #[test]
+    fn no_demo_looks_stuck() {
+        for extent in [
+            (200, 150, 20),
+            (1, 1, 1),
+            (30, 30, 3),
+            (250, 250, 250),
+            (4096, 4096, 64),
+        ] {
+            let info = StackInfo {
+                name: "s".to_owned(),
+                extent: UVec3::from(extent),
+                voxel_nm: None,
+            };
+            let tile = UVec2::splat(tile_edge(info.extent.truncate()));
+            let config = SimulateConfig {
+                tile,
+                ..SimulateConfig::default()
+            };
+            let tiles = Plan::new(&config, &info).unwrap().tile_count();
+            let each = tile.as_dvec2().element_product() / 1e6;
+            let rate = show_rate(tiles, each * tiles as f64);
+            let (first, all) = (each / rate, each * tiles as f64 / rate);
+            assert!(first <= 0.2501, "{extent:?}: a tile every {first} s");
+            assert!(all <= SHOW + 0.001, "{extent:?}: {all} s");
+        }
+        // Longer where there is enough to see for longer.
+        assert!((show_rate(2250, 36.864) - 36.864 / SHOW).abs() < 1e-9);
+        assert!((show_rate(80, 1.0) - 1.0 / 20.0).abs() < 1e-9);
     }
 }

@@ -8,6 +8,7 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::pyramid::Encoding;
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
 
+use crate::arguments::volume_name;
 use crate::interrupt::cancel_when_interrupted;
 use crate::progress::Shown;
 use crate::report::say;
@@ -28,11 +29,11 @@ pub(crate) struct Ingest {
     #[command(flatten)]
     stored: Stored,
 
-    /// Name of the volume; as the acquisition archive says otherwise
-    #[arg(long)]
+    /// Name of the volume [default: as the acquisition archive says]
+    #[arg(long, value_parser = volume_name)]
     volume: Option<String>,
 
-    /// Tiles in work at the same time
+    /// Tiles in work at the same time [default: 2]
     #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
     workers: Option<u16>,
 }
@@ -108,13 +109,15 @@ impl Ingest {
             tiles,
             moved,
             quarantined,
+            early,
             ..
         } = done?;
         archive.catalog().close().await;
-        say(&format!(
-            "{tiles} tiles taken in, {moved} moved, {quarantined} set aside: {}",
-            self.archive.display()
-        ));
+        let mut done = format!("{tiles} tiles taken in, {moved} moved, {quarantined} set aside");
+        if early > 0 {
+            done.push_str(&format!(", {early} transforms of tiles that have not come"));
+        }
+        say(&format!("{done}: {}", self.archive.display()));
         Ok(())
     }
 }
@@ -122,6 +125,14 @@ impl Ingest {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Those that the help names.
+    #[test]
+    fn defaults_are_as_told() {
+        let default = IngestOptions::DEFAULT;
+        assert_eq!(default.workers, 2);
+        assert_eq!(default.encoding, Encoding::Jpeg { quality: 85 });
+    }
 
     #[test]
     fn the_microscope_keeps_its_folder() {

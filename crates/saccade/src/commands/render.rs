@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use glam::UVec2;
 use saccade_core::camera::Camera;
@@ -12,7 +12,7 @@ use saccade_render::{Gpu, View};
 use saccade_stream::{Session, SessionOptions, SettleError, Status};
 use saccade_view::background_from_text;
 
-use crate::arguments::{picture_size, seconds};
+use crate::arguments::{picture, picture_size, seconds};
 use crate::open::Place;
 use crate::report::tell;
 
@@ -23,16 +23,16 @@ pub(crate) struct Render {
     #[arg(value_name = "URL|ARCHIVE")]
     place: Place,
 
-    /// The picture to write
-    #[arg(short, long, value_name = "FILE")]
+    /// The PNG file to write
+    #[arg(short, long, value_name = "FILE", value_parser = picture)]
     output: PathBuf,
 
-    /// Name of the volume; the first otherwise
+    /// Name of the volume [default: the first]
     #[arg(long)]
     volume: Option<String>,
 
-    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres; the whole volume
-    /// otherwise
+    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres [default: the whole
+    /// volume]
     #[arg(long, allow_hyphen_values = true)]
     camera: Option<Camera>,
 
@@ -61,7 +61,8 @@ pub(crate) struct Render {
     #[arg(long, value_name = "MIB", default_value_t = 512)]
     gpu_memory: u32,
 
-    /// How long to wait for the picture to be complete [s]
+    /// How long to wait for the picture to be complete [s]; 0 takes what one frame brings, which is
+    /// of use with --partial
     #[arg(long, value_name = "SECONDS", value_parser = seconds, default_value = "60")]
     timeout: Duration,
 
@@ -99,6 +100,10 @@ impl Render {
             {
                 *status
             }
+            Err(SettleError::Timeout { .. }) if self.timeout.is_zero() => bail!(
+                "one frame did not complete the picture, and it was not written; --timeout waits \
+                 longer, --partial takes it as it is"
+            ),
             Err(error) => {
                 return Err(error).context(
                     "the picture is not complete and was not written; --timeout waits longer, \
@@ -145,7 +150,10 @@ fn fidelity(status: &Status) -> String {
         Some(level) => format!("level {level}"),
         None => "nothing of the volume in view".to_owned(),
     };
-    if status.complete {
+    if status.revision == 0 {
+        // Complete it is, but so is every picture of nothing.
+        "the volume has no tiles yet: the picture is empty".to_owned()
+    } else if status.complete {
         format!("complete, {level}, revision {}", status.revision)
     } else {
         let missing = status.fidelity.missing;

@@ -3,10 +3,12 @@
 use std::path::Path;
 
 use anyhow::Result;
-use saccade_ingest::replay::{Acquisition, ReplayConfig, run as replay};
+use saccade_ingest::replay::{Acquisition, ReplayConfig, check as check_replay, run as replay};
 use saccade_ingest::simulate::clock::SystemClock;
 use saccade_ingest::simulate::stack::Stack;
-use saccade_ingest::simulate::{Plan, SimulateConfig, SimulateSummary, run as simulate};
+use saccade_ingest::simulate::{
+    Plan, SimulateConfig, SimulateSummary, check as check_simulate, run as simulate,
+};
 use saccade_ingest::{Cancel, Progress};
 
 /// What stands under the microscope.
@@ -53,6 +55,18 @@ impl Subject {
             Self::Tissue { config, .. } => config.rate_mpixel_s = rate,
             Self::Tiles { config, .. } => config.rate_mpixel_s = rate,
         }
+    }
+
+    /// Whether the acquisition archive `out` could be begun, or gone on with.
+    pub(crate) fn check(&self, out: &Path) -> Result<()> {
+        match self {
+            Self::Tissue { stack, config } => check_simulate(config, &**stack, out)?,
+            Self::Tiles {
+                acquisition,
+                config,
+            } => check_replay(config, acquisition, out)?,
+        }
+        Ok(())
     }
 
     /// Writes the acquisition archive `out`; blocks.

@@ -14,11 +14,12 @@ pub(crate) struct View {
     #[arg(value_name = "URL|ARCHIVE")]
     place: Place,
 
-    /// Name of the volume; the first otherwise
+    /// Name of the volume [default: the first]
     #[arg(long)]
     volume: Option<String>,
 
-    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres
+    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres [default: the whole
+    /// volume]
     #[arg(long, allow_hyphen_values = true)]
     camera: Option<Camera>,
 

@@ -4,7 +4,7 @@ use std::net::TcpListener;
 use std::path::Path;
 use std::process::Output;
 
-use super::{archive, run, saccade, simulate, stderr};
+use super::{Running, archive, run, saccade, simulate, stderr};
 
 /// Failed, in one report that holds all of `parts`.
 fn assert_failed(output: &Output, code: i32, parts: &[&str]) {
@@ -103,8 +103,211 @@ fn a_volume_of_another_size() {
     assert_failed(
         &run(again),
         1,
-        &["another acquisition", "empty folder", text(&other)],
+        &[
+            "another acquisition",
+            "extent is 150 x 131 x 12 there, 99 x 99 x 9 now",
+            "tile is 64 x 64 there, 1024 x 1024 now",
+            "empty folder",
+            text(&other),
+        ],
     );
+}
+
+/// What is there goes on only with the options that made it.
+#[test]
+fn demos_and_simulations_of_other_options_do_not_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let work = folder.path().join("work");
+    simulate(&work.join("acquisition"), "100,90,3");
+    let demo = |more: &[&str]| {
+        let fixed = [
+            "demo",
+            "--no-open",
+            "--once",
+            "--port",
+            "0",
+            "--rate",
+            "max",
+            "--voxel-nm",
+            "16,16,40",
+            "--work",
+        ];
+        run(fixed
+            .iter()
+            .copied()
+            .chain([text(&work)])
+            .chain(more.iter().copied()))
+    };
+    let size = ["--extent", "100,90,3", "--tile", "64x64"];
+    let other = demo(&[&size[..], &["--seed", "5", "--overlap", "0.2"]].concat());
+    assert_failed(
+        &other,
+        1,
+        &["overlap is 0.1 there, 0.2 now", "seed is 1 there, 5 now"],
+    );
+    assert!(other.stdout.is_empty(), "nothing is offered");
+    assert!(!work.join("archive").exists());
+    let same = demo(&size);
+    assert!(same.status.success(), "{}", stderr(&same));
+
+    std::fs::remove_file(work.join("acquisition/simulation.json")).unwrap();
+    assert_failed(&demo(&size), 1, &["not simulated", "empty folder"]);
+}
+
+/// A folder of sections below others, as data sets are often given away.
+fn sections(folder: &Path) {
+    std::fs::create_dir_all(folder).unwrap();
+    for n in 0..3_u8 {
+        let image = image::GrayImage::from_fn(70, 60, |x, y| {
+            image::Luma([u8::try_from((x * 3 + y) % 200).unwrap() + n])
+        });
+        image.save(folder.join(format!("s{n}.png"))).unwrap();
+    }
+}
+
+#[test]
+fn inputs_keep_their_name_and_tell_what_is_assumed() {
+    let folder = tempfile::tempdir().unwrap();
+    let input = folder.path().join("cortex 7");
+    sections(&input.join("deep/grayscale_maps"));
+    let out = folder.path().join("out");
+    let base = [
+        "simulate",
+        text(&out),
+        "--input",
+        text(&input),
+        "--rate",
+        "max",
+    ];
+    let base = base.iter().copied().chain(["--tile", "48x48"]);
+    let output = run(base.clone());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let assumed = "voxel size assumed: 4 x 4 x 40 nm; --voxel-nm sets it";
+    assert_eq!(
+        said.lines().filter(|line| *line == assumed).count(),
+        1,
+        "{said}"
+    );
+    assert!(said.contains("simulate: 12 of 12 tiles, "), "{said}");
+    let info = std::fs::read_to_string(out.join("volume.json")).unwrap();
+    assert!(info.contains("\"cortex-7\""), "{info}");
+
+    // Other tissue of the same size does not go on there.
+    let first = input.join("deep/grayscale_maps/s0.png");
+    std::fs::copy(input.join("deep/grayscale_maps/s2.png"), first).unwrap();
+    assert_failed(&run(base), 1, &["another acquisition", "input is stack"]);
+    let told = ["--voxel-nm", "5", "--tile", "48x48", "--rate", "max"];
+    let out = folder.path().join("out2");
+    let output = run(["simulate", text(&out), "--input", text(&input)]
+        .iter()
+        .chain(&told));
+    assert!(!stderr(&output).contains("assumed"), "{}", stderr(&output));
+}
+
+#[test]
+fn a_replay_refuses_what_is_for_tissue() {
+    let folder = tempfile::tempdir().unwrap();
+    let input = folder.path().join("real");
+    sections(&input);
+    let list = "s0.png 0 0 0\ns1.png 60 0 0\ns2.png 0 0 1\n";
+    std::fs::write(input.join("positions.txt"), list).unwrap();
+    let out = folder.path().join("out");
+    let base = [
+        "simulate",
+        text(&out),
+        "--input",
+        text(&input),
+        "--rate",
+        "max",
+    ];
+    let with = |more: &[&'static str]| run(base.iter().copied().chain(more.iter().copied()));
+    let refused = with(&["--tile", "64x64", "--jitter", "3", "--shuffle"]);
+    assert_failed(
+        &refused,
+        1,
+        &["--tile, --jitter, --shuffle", "replayed as it is"],
+    );
+    assert!(!out.exists());
+    let replayed = with(&[]);
+    assert!(replayed.status.success(), "{}", stderr(&replayed));
+    assert!(stderr(&replayed).contains("voxel size assumed: 73 x 73 x 200 nm"));
+
+    // Another list into the same folder.
+    std::fs::write(input.join("positions.txt"), list.replace("60 0", "50 0")).unwrap();
+    assert_failed(
+        &with(&[]),
+        1,
+        &["another acquisition", "extent is 130 x 60 x 2 there"],
+    );
+    std::fs::write(
+        input.join("positions.txt"),
+        list.replace("s2.png 0", "s2.png 9"),
+    )
+    .unwrap();
+    assert_failed(
+        &with(&[]),
+        1,
+        &["another acquisition", "input is acquisition"],
+    );
+}
+
+#[test]
+fn a_volume_without_tiles() {
+    let folder = tempfile::tempdir().unwrap();
+    let acquisition = folder.path().join("acquisition");
+    std::fs::create_dir(&acquisition).unwrap();
+    let info = r#"{"name":"later","extent":[50,40,9],"voxel_nm":[4,4,40]}"#;
+    std::fs::write(acquisition.join("volume.json"), info).unwrap();
+    let archive = folder.path().join("archive");
+    let ingested = run(["ingest", text(&acquisition), text(&archive), "--once"]);
+    assert!(ingested.status.success(), "{}", stderr(&ingested));
+    let picture = folder.path().join("picture.png");
+    let output = run([
+        "render",
+        text(&archive),
+        "-o",
+        text(&picture),
+        "--size",
+        "16x16",
+    ]);
+    let required = std::env::var("SACCADE_GPU_TESTS").is_ok_and(|v| v == "require");
+    if !required && stderr(&output).contains("no GPU adapter") {
+        return;
+    }
+    assert!(output.status.success(), "{}", stderr(&output));
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(
+        said.contains("no tiles yet") && !said.contains("complete"),
+        "{said}"
+    );
+}
+
+#[test]
+fn descriptions_of_impossible_volumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let acquisition = folder.path().join("acquisition");
+    std::fs::create_dir(&acquisition).unwrap();
+    let out = folder.path().join("archive");
+    let cases: [(&str, &[&str]); 3] = [
+        (
+            r#"{"name":"v","extent":[50,0,9],"voxel_nm":[4,4,40]}"#,
+            &["[50, 0, 9]", "every axis needs at least 1 voxel"],
+        ),
+        (
+            r#"{"name":"a volume","extent":[50,40,9],"voxel_nm":[4,4,40]}"#,
+            &["\"a volume\" cannot name a volume", "letters, digits"],
+        ),
+        (
+            r#"{"name":"v","size":[0,0],"voxel_nm":[4,4,40]}"#,
+            &["extent"],
+        ),
+    ];
+    for (info, parts) in cases {
+        std::fs::write(acquisition.join("volume.json"), info).unwrap();
+        let output = run(["ingest", text(&acquisition), text(&out), "--once"]);
+        assert_failed(&output, 1, &[&["volume.json"], parts].concat());
+    }
 }
 
 #[test]
@@ -165,7 +368,27 @@ fn no_gpu() {
 
 #[test]
 fn words_that_make_no_sense() {
-    let cases: [(&[&str], &[&str]); 9] = [
+    let cases: [(&[&str], &[&str]); 14] = [
+        (
+            &["simulate", "a", "--input", "b", "--extent", "9,9,9"],
+            &["--extent", "cannot be used with", "--input"],
+        ),
+        (
+            &["demo", "--extent", "9,9,9", "--input", "b"],
+            &["--extent", "cannot be used with", "--input"],
+        ),
+        (
+            &["simulate", "a", "--phantom", "--name", "my volume"],
+            &["my volume", "letters, digits"],
+        ),
+        (
+            &["ingest", "a", "b", "--volume", "../b"],
+            &["../b", "letters, digits"],
+        ),
+        (
+            &["render", "a", "-o", "x.jpg"],
+            &["x.jpg", "PNG only", "name it .png"],
+        ),
         (
             &["render", "a", "-o", "b", "--camera", "here"],
             &["here", "yaw,pitch,distance"],
@@ -214,6 +437,8 @@ fn bad_tiles_are_set_aside_and_told() {
     let flat = image::GrayImage::from_pixel(20, 20, image::Luma([90]));
     flat.save(acquisition.join("tiles/far.png")).unwrap();
     std::fs::write(acquisition.join("tiles/torn.png"), "no image at all").unwrap();
+    let red = image::RgbImage::from_pixel(20, 20, image::Rgb([190, 20, 30]));
+    red.save(acquisition.join("tiles/red.png")).unwrap();
     let record = |name: &str, x: u32| {
         format!(
             "{{\"record\":\"tile\",\"tile\":\"{name}\",\"file\":\"tiles/{name}.png\",\"section\":1,\
@@ -222,7 +447,9 @@ fn bad_tiles_are_set_aside_and_told() {
     };
     let records = acquisition.join("tiles.jsonl");
     let mut lines = std::fs::read_to_string(&records).unwrap();
-    lines.extend([record("deep", 0), record("far", 5000), record("torn", 0)]);
+    lines.extend(["deep", "torn", "red"].map(|name| record(name, 0)));
+    lines.push_str(&record("far", 5000));
+    lines.push_str("{\"record\":\"transform\",\"tile\":\"never\",\"transform\":[1,0,0,1,0,0]}\n");
     std::fs::write(&records, lines).unwrap();
 
     let archive = folder.path().join("archive");
@@ -231,10 +458,39 @@ fn bad_tiles_are_set_aside_and_told() {
     assert!(output.status.success(), "{said}");
     let summary = said.lines().last().unwrap();
     assert!(
-        summary.contains("12 tiles taken in") && summary.contains("3 set aside"),
+        summary.contains("12 tiles taken in")
+            && summary.contains("4 set aside")
+            && summary.contains("1 transforms of tiles that have not come"),
         "{said}"
     );
-    for part in ["deep.png", "16", "far", "outside the volume", "torn.png"] {
+    for part in [
+        "deep.png",
+        "16",
+        "far",
+        "outside the volume",
+        "torn.png",
+        "in colour",
+    ] {
         assert!(said.contains(part), "{part:?} is not in: {said}");
     }
+
+    let (_server, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let get = async {
+        let status = reqwest::get(format!("{url}v/phantom/status.json")).await?;
+        status.json::<serde_json::Value>().await
+    };
+    let status = runtime.block_on(get).unwrap();
+    assert_eq!(status["early_transforms"], 1);
+    let mut named: Vec<_> = status["quarantined"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|q| q["tile"].as_str().unwrap())
+        .collect();
+    named.sort_unstable();
+    assert_eq!(named, ["deep", "far", "red", "torn"]);
 }
