@@ -45,3 +45,10 @@ pub enum DeliveryError {
         expected: usize,
     },
 }
+
+/// Whether a brick still is what the volume holds, as far as whoever delivers it knows.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Freshness {
+    Current,
+    Outdated,
+}

@@ -10,7 +10,7 @@ use saccade_core::transfer::{TABLE_LEN, TransferFunction};
 use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
-use crate::delivery::{BrickVoxels, Delivery, DeliveryError};
+use crate::delivery::{BrickVoxels, Delivery, DeliveryError, Freshness};
 use crate::frame::{frame_uniform, transfer_storage};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
@@ -275,6 +275,28 @@ impl Renderer {
         id: BrickId,
         voxels: BrickVoxels<'_>,
     ) -> Result<Delivery, DeliveryError> {
+        self.take(id, voxels, Freshness::Current)
+    }
+
+    /// Takes a brick that changed on its way: the next frame draws it, and misses it again.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::deliver`].
+    pub fn deliver_outdated(
+        &mut self,
+        id: BrickId,
+        voxels: BrickVoxels<'_>,
+    ) -> Result<Delivery, DeliveryError> {
+        self.take(id, voxels, Freshness::Outdated)
+    }
+
+    fn take(
+        &mut self,
+        id: BrickId,
+        voxels: BrickVoxels<'_>,
+        freshness: Freshness,
+    ) -> Result<Delivery, DeliveryError> {
         if !self.memory.contains(id) {
             return Err(DeliveryError::NoSuchBrick { id });
         }
@@ -291,7 +313,10 @@ impl Renderer {
             Some(brick) if brick.range[1] > 0 => self.memory.place(id),
             _ => self.memory.place_empty(id),
         };
-        self.note(id, placement, stored.as_ref());
+        if freshness == Freshness::Outdated {
+            self.memory.invalidate_brick(id);
+        }
+        self.note(id, placement, stored.as_ref(), freshness);
         Ok(match (placement, stored) {
             (Placement::Slot(slot), Some(brick)) => {
                 self.resources
@@ -309,7 +334,13 @@ impl Renderer {
     }
 
     /// Tells the octree of a delivered brick and of what it displaced.
-    fn note(&mut self, id: BrickId, placement: Placement, stored: Option<&StoredBrick<'_>>) {
+    fn note(
+        &mut self,
+        id: BrickId,
+        placement: Placement,
+        stored: Option<&StoredBrick<'_>>,
+        freshness: Freshness,
+    ) {
         let Some(octree) = &mut self.octree else {
             self.memory.take_evicted();
             return;
@@ -317,13 +348,17 @@ impl Renderer {
         for evicted in self.memory.take_evicted() {
             octree.remove(evicted);
         }
-        let values = stored.map_or(BrickValues::uniform(Values::ZERO), |brick| {
-            octree.values_of(id, &brick.voxels)
+        // Values that no longer hold would hide what came instead of them.
+        let current = freshness == Freshness::Current;
+        let values = current.then(|| match stored {
+            Some(brick) => octree.values_of(id, &brick.voxels),
+            None => BrickValues::uniform(Values::ZERO),
         });
-        match placement {
-            Placement::Slot(_) => octree.insert(id, values),
+        match (placement, values) {
+            (Placement::Slot(_), values) => octree.insert(id, values),
             // What is known of a brick outlives it, even one that found no room.
-            Placement::Empty | Placement::NoRoom => octree.note(id, values),
+            (Placement::Empty | Placement::NoRoom, Some(values)) => octree.note(id, values),
+            (Placement::Empty | Placement::NoRoom, None) => {}
         }
     }
 

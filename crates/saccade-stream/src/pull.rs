@@ -4,6 +4,12 @@
 //! every order of events can be tested. [`crate::Session`] connects it to a source and a renderer.
 //!
 //! A brick's state follows from the states of its chunks; the README has the table.
+//!
+//! # While the volume grows
+//!
+//! A coarse chunk may change more often than it can be read. What changed meanwhile is therefore
+//! delivered as it is, marked as out of date, and then asked for again: each answer is newer than
+//! the one before, and only what was asked for after the last change ends the asking.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
@@ -84,9 +90,30 @@ pub struct Delivery {
     pub cut: bool,
 }
 
+/// Whether a delivered brick is what the volume holds now, as far as is known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Freshness {
+    /// Nothing changed since its chunks were asked for.
+    Current,
+    /// Something did.
+    Outdated,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Readiness {
+    /// A chunk is missing, or is no newer than what was delivered.
+    NotYet,
+    /// It can be delivered, and is up to date.
+    Current,
+    /// It can be delivered, but is not up to date.
+    Outdated,
+}
+
 #[derive(Debug)]
 struct InFlight {
     ticket: Ticket,
+    /// Whether its voxels changed after it was asked for.
+    outdated: bool,
     /// Report that last wanted it.
     wanted_in: u64,
     attempts: u32,
@@ -96,6 +123,16 @@ struct InFlight {
 struct Backoff {
     until: Duration,
     attempts: u32,
+}
+
+/// A chunk of the bricks being loaded.
+#[derive(Clone, Debug)]
+struct Loaded {
+    chunk: Chunk,
+    /// Whether its voxels changed after it was asked for.
+    outdated: bool,
+    /// Answers there were before it.
+    arrived: u64,
 }
 
 /// The pull of one volume.
@@ -110,7 +147,11 @@ pub struct Pull {
     /// Bricks given to the renderer before this frame was drawn: older reports miss them in vain.
     delivered: HashMap<BrickId, u64>,
     /// Chunks of the bricks being loaded.
-    window: HashMap<ChunkId, Chunk>,
+    window: HashMap<ChunkId, Loaded>,
+    /// Answers so far.
+    answers: u64,
+    /// Wanted bricks that were delivered out of date, and the answers there had been by then.
+    outdated: HashMap<BrickId, u64>,
     in_flight: BTreeMap<ChunkKey, InFlight>,
     tickets: HashMap<Ticket, ChunkId>,
     backoff: BTreeMap<ChunkKey, Backoff>,
@@ -151,6 +192,8 @@ impl Pull {
             reports: 0,
             delivered: HashMap::new(),
             window: HashMap::new(),
+            answers: 0,
+            outdated: HashMap::new(),
             in_flight: BTreeMap::new(),
             tickets: HashMap::new(),
             backoff: BTreeMap::new(),
@@ -174,6 +217,7 @@ impl Pull {
         let mut seen = HashSet::with_capacity(misses.len());
         let fresh = |id: &&BrickId| !self.delivered.contains_key(*id) && seen.insert(**id);
         self.wanted = misses.iter().filter(fresh).copied().collect();
+        self.outdated.retain(|id, _| seen.contains(id));
     }
 
     /// What to ask the source for now, and what no longer.
@@ -183,15 +227,17 @@ impl Pull {
     pub fn plan(&mut self, now: Duration) -> Actions {
         let mut actions = Actions::default();
         let wanted = self.window_chunks();
+        let repeated = self.exhausted();
         let mut window = HashMap::with_capacity(wanted.len());
         for &id in &wanted {
-            let here = self
-                .window
-                .remove(&id)
-                .or_else(|| self.cache.get(id).cloned());
+            let here = self.window.remove(&id).or_else(|| self.cached(id));
             if let Some(chunk) = here {
                 window.insert(id, chunk);
-            } else if let Some(in_flight) = self.in_flight.get_mut(&key(id)) {
+                if !repeated.contains(&id) {
+                    continue;
+                }
+            }
+            if let Some(in_flight) = self.in_flight.get_mut(&key(id)) {
                 in_flight.wanted_in = self.reports;
             } else if self.in_flight.len() < self.limits.in_flight {
                 let backoff = self.backoff.get(&key(id));
@@ -218,6 +264,15 @@ impl Pull {
         actions
     }
 
+    fn cached(&self, id: ChunkId) -> Option<Loaded> {
+        let chunk = self.cache.get(id)?.clone();
+        Some(Loaded {
+            chunk,
+            outdated: false,
+            arrived: 0,
+        })
+    }
+
     fn start(&mut self, id: ChunkId) -> Request {
         let ticket = Ticket(self.next_ticket);
         self.next_ticket += 1;
@@ -226,6 +281,7 @@ impl Pull {
             key(id),
             InFlight {
                 ticket,
+                outdated: false,
                 wanted_in: self.reports,
                 attempts,
             },
@@ -258,7 +314,8 @@ impl Pull {
     }
 
     fn bytes_expected(&self, id: ChunkId) -> u64 {
-        let known = self.window.get(&id).or_else(|| self.cache.get(id));
+        let known = self.window.get(&id).map(|loaded| &loaded.chunk);
+        let known = known.or_else(|| self.cache.get(id));
         known.map_or_else(|| chunk_bytes(&self.volume) as u64, bytes_of)
     }
 
@@ -267,16 +324,21 @@ impl Pull {
             && chunks_of(brick, &self.volume).any(|id| self.failed.contains(&id))
     }
 
-    /// Takes an answer. One that was cancelled, or began before a change of its voxels, is dropped.
+    /// Takes an answer. One that was cancelled is dropped.
     pub fn answer(&mut self, ticket: Ticket, answer: Result<Chunk, ChunkError>, now: Duration) {
         let Some(id) = self.tickets.remove(&ticket) else {
             return;
         };
-        let attempts = self
-            .in_flight
-            .remove(&key(id))
-            .map_or(0, |request| request.attempts);
+        let Some(request) = self.in_flight.remove(&key(id)) else {
+            return;
+        };
+        let InFlight {
+            attempts, outdated, ..
+        } = request;
+        self.answers += 1;
         match answer {
+            // What was wrong then may be right now: it is asked for again.
+            Err(error) if outdated && !error.is_transient() => {}
             Ok(Chunk::Voxels(voxels)) if voxels.len() != chunk_bytes(&self.volume) => {
                 let want = chunk_bytes(&self.volume);
                 let message = format!("{id} has {} bytes instead of {want}", voxels.len());
@@ -286,8 +348,15 @@ impl Pull {
                 if self.failure.as_ref().is_some_and(|(of, _)| *of == id) {
                     self.failure = None;
                 }
-                self.cache.insert(id, chunk.clone());
-                self.window.insert(id, chunk);
+                if !outdated {
+                    self.cache.insert(id, chunk.clone());
+                }
+                let loaded = Loaded {
+                    chunk,
+                    outdated,
+                    arrived: self.answers,
+                };
+                self.window.insert(id, loaded);
             }
             Err(error) if error.is_transient() => {
                 let asked = error.retry_after();
@@ -311,33 +380,63 @@ impl Pull {
         self.failure = Some((id, message));
     }
 
-    /// Voxels of level 0 changed: chunks that hold them are forgotten, and requests for them that
-    /// are in flight dropped, since they may have begun before. Returns the latter.
-    pub fn change(&mut self, voxels: VoxelBox) -> Vec<Ticket> {
+    /// Voxels of level 0 changed: chunks that hold them, and requests for them that are in flight,
+    /// are out of date.
+    pub fn change(&mut self, voxels: VoxelBox) {
         let volume = &self.volume;
         let touched = |id: ChunkId| is_touched(id, volume, voxels);
         self.cache.invalidate(volume, voxels);
-        self.window.retain(|&id, _| !touched(id));
         self.backoff.retain(|&chunk, _| !touched(id_of(chunk)));
         self.failed.retain(|&id| !touched(id));
         if self.failure.as_ref().is_some_and(|(id, _)| touched(*id)) {
             self.failure = None;
         }
-        let mut cancelled = Vec::new();
-        self.in_flight.retain(|&chunk, request| {
-            let drop = touched(id_of(chunk));
-            if drop {
-                cancelled.push(request.ticket);
-            }
-            !drop
-        });
-        for ticket in &cancelled {
-            self.tickets.remove(ticket);
+        #[expect(clippy::iter_over_hash_type, reason = "each is marked for itself")]
+        for (&id, loaded) in &mut self.window {
+            loaded.outdated |= touched(id);
         }
-        cancelled
+        for (&chunk, request) in &mut self.in_flight {
+            request.outdated |= touched(id_of(chunk));
+        }
     }
 
-    /// Hands ready bricks to `sink`, most wanted first, within the budget.
+    /// Whether a chunk that is here takes a brick any further: one out of date does so once.
+    fn serves(&self, brick: BrickId, loaded: &Loaded) -> bool {
+        let before = self.outdated.get(&brick);
+        !loaded.outdated || before.is_none_or(|&before| loaded.arrived > before)
+    }
+
+    /// Chunks that are here and have to come once more.
+    fn exhausted(&self) -> HashSet<ChunkId> {
+        let again = self
+            .wanted
+            .iter()
+            .filter(|id| self.outdated.contains_key(*id));
+        let chunks = again.flat_map(|&brick| {
+            let chunks = chunks_of(brick, &self.volume);
+            chunks.filter(move |id| {
+                let here = self.window.get(id);
+                here.is_some_and(|loaded| !self.serves(brick, loaded))
+            })
+        });
+        chunks.collect()
+    }
+
+    fn readiness(&self, brick: BrickId) -> Readiness {
+        let mut readiness = Readiness::Current;
+        for id in chunks_of(brick, &self.volume) {
+            match self.window.get(&id) {
+                Some(loaded) if !self.serves(brick, loaded) => return Readiness::NotYet,
+                Some(loaded) if loaded.outdated => readiness = Readiness::Outdated,
+                Some(_) => {}
+                None => return Readiness::NotYet,
+            }
+        }
+        readiness
+    }
+
+    /// Hands ready bricks to `sink`, most wanted first, within the budget, and says of each whether
+    /// it is up to date. One that is not is to be missed again by the frames that draw it.
     ///
     /// `frame` is the next frame to be drawn: the first that will not miss them. `clock` tells the
     /// time as given elsewhere.
@@ -345,29 +444,44 @@ impl Pull {
         &mut self,
         frame: u64,
         clock: impl Fn() -> Duration,
-        mut sink: impl FnMut(BrickId, BrickVoxels<'_>),
+        mut sink: impl FnMut(BrickId, BrickVoxels<'_>, Freshness),
     ) -> Delivery {
         let mut budget = Budget::new(&self.limits, clock());
-        let (volume, window) = (&self.volume, &self.window);
-        let before = self.wanted.len();
+        let wanted = std::mem::take(&mut self.wanted);
+        let before = wanted.len();
         let mut open = true;
-        self.wanted.retain(|&brick| {
+        for brick in wanted {
             open = open && budget.allows(BRICK_STORED_VOXELS, clock());
-            if !open {
-                return true;
-            }
-            let voxels = self.assembler.assemble(brick, volume, |id| window.get(&id));
-            let Some(voxels) = voxels else {
-                return true;
+            let readiness = if open {
+                self.readiness(brick)
+            } else {
+                Readiness::NotYet
+            };
+            let freshness = match readiness {
+                Readiness::Current => Freshness::Current,
+                Readiness::Outdated => Freshness::Outdated,
+                Readiness::NotYet => {
+                    self.wanted.push(brick);
+                    continue;
+                }
+            };
+            let window = &self.window;
+            let chunk = |id| window.get(&id).map(|loaded| &loaded.chunk);
+            let Some(voxels) = self.assembler.assemble(brick, &self.volume, chunk) else {
+                self.wanted.push(brick);
+                continue;
             };
             budget.spend(match voxels {
                 BrickVoxels::Voxels(voxels) => voxels.len(),
                 BrickVoxels::Empty => 64,
             });
-            sink(brick, voxels);
+            sink(brick, voxels, freshness);
             self.delivered.insert(brick, frame);
-            false
-        });
+            match freshness {
+                Freshness::Current => self.outdated.remove(&brick),
+                Freshness::Outdated => self.outdated.insert(brick, self.answers),
+            };
+        }
         Delivery {
             bricks: before - self.wanted.len(),
             cut: !open,
@@ -382,31 +496,21 @@ impl Pull {
         if self.has_failed(brick) {
             return BrickState::Failed;
         }
-        let mut state = BrickState::Ready;
-        let mut any_here = false;
+        if self.readiness(brick) != Readiness::NotYet {
+            return BrickState::Ready;
+        }
+        let mut state = BrickState::Wanted;
         for id in chunks_of(brick, &self.volume) {
-            if self.window.contains_key(&id) {
-                any_here = true;
-                continue;
-            }
             let chunk = if self.backoff.contains_key(&key(id)) {
-                BrickState::Waiting
-            } else if self.in_flight.contains_key(&key(id)) {
-                BrickState::Loading
+                return BrickState::Waiting;
             } else {
-                BrickState::Wanted
+                self.in_flight.contains_key(&key(id)) || self.window.contains_key(&id)
             };
-            state = match (state, chunk) {
-                (BrickState::Waiting, _) | (_, BrickState::Waiting) => BrickState::Waiting,
-                (BrickState::Loading, _) | (_, BrickState::Loading) => BrickState::Loading,
-                _ => BrickState::Wanted,
-            };
+            if chunk {
+                state = BrickState::Loading;
+            }
         }
-        if state == BrickState::Wanted && any_here {
-            BrickState::Loading
-        } else {
-            state
-        }
+        state
     }
 
     /// How far it is.
@@ -434,7 +538,8 @@ impl Pull {
     /// Memory that chunks take \[bytes\]. One that is both being loaded and kept counts twice, though
     /// it is there once.
     pub fn host_bytes(&self) -> u64 {
-        let window = self.window.values().map(bytes_of).sum::<u64>();
+        let window = self.window.values().map(|loaded| bytes_of(&loaded.chunk));
+        let window = window.sum::<u64>();
         window + self.cache.bytes()
     }
 }

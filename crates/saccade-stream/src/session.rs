@@ -17,7 +17,7 @@ use saccade_source::VolumeSource;
 
 use crate::clock::Clock;
 use crate::policy::{Limits, Pace, Refresh, Retry};
-use crate::pull::{Progress, Pull};
+use crate::pull::{Freshness, Progress, Pull};
 use crate::requests::{Event, Requests};
 
 /// Called, from any thread, when [`Session::frame`] would find something new.
@@ -338,8 +338,7 @@ impl Session {
                 Event::Answer { ticket, answer } => self.pull.answer(ticket, answer, now),
                 Event::Change(change) => {
                     self.revision = self.revision.max(change.revision);
-                    let cancelled = self.pull.change(change.voxels);
-                    self.requests.cancel(&cancelled);
+                    self.pull.change(change.voxels);
                     self.renderer.invalidate(change.voxels);
                     self.refresh.changed();
                     self.dirty = true;
@@ -371,10 +370,15 @@ impl Session {
     /// Hands ready bricks to the renderer; whether there may be more.
     fn deliver(&mut self) -> bool {
         let (renderer, clock) = (&mut self.renderer, self.clock);
-        let sink = |id, voxels: saccade_render::BrickVoxels<'_>| match renderer.deliver(id, voxels)
-        {
-            Ok(Delivery::Resident | Delivery::Empty | Delivery::NoRoom) => {}
-            Err(error) => log::error!("a brick was refused: {error}"),
+        let sink = |id, voxels: saccade_render::BrickVoxels<'_>, freshness| {
+            let delivered = match freshness {
+                Freshness::Current => renderer.deliver(id, voxels),
+                Freshness::Outdated => renderer.deliver_outdated(id, voxels),
+            };
+            match delivered {
+                Ok(Delivery::Resident | Delivery::Empty | Delivery::NoRoom) => {}
+                Err(error) => log::error!("a brick was refused: {error}"),
+            }
         };
         let delivery = self.pull.deliver(self.drawn + 1, || clock.now(), sink);
         self.dirty |= delivery.bricks > 0;

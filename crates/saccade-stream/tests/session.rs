@@ -214,6 +214,30 @@ async fn a_change_appears_in_the_same_session() {
     );
 }
 
+/// A growing volume changes faster than its coarse chunks can be read.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_volume_that_never_stops_changing_is_seen() {
+    let Some(gpu) = test_gpu().await else { return };
+    let slow = Arc::new(Unreliable::new(|_, _| Ok(Duration::from_millis(60))));
+    let view = view(&*slow);
+    let mut session = Session::new(&gpu, slow.clone(), options()).unwrap();
+    let (mut changes, mut seen) = (0_u8, false);
+    let started = tokio::time::Instant::now();
+    let whole = VoxelBox::of_size(EXTENT);
+    while !seen && started.elapsed() < PATIENCE {
+        changes = changes.wrapping_add(1) | 128;
+        let voxels: Vec<u8> = whole.iter().map(|at| value(at).max(changes)).collect();
+        slow.inner.set(whole, &voxels).unwrap();
+        let status = session.frame(&view);
+        assert!(!status.complete, "it changed a moment ago");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+        let image = session.renderer().read_pixels().await.unwrap();
+        seen = image.rgba.chunks_exact(4).any(|p| p != &image.rgba[..4]);
+    }
+    assert!(seen, "nothing was drawn");
+    picture(&mut session, &view).await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn lasting_failures_end_the_wait_and_say_why() {
     let Some(gpu) = test_gpu().await else { return };

@@ -255,6 +255,25 @@ impl VirtualMemory {
         }
     }
 
+    /// Marks one brick as out of date, whatever is known of it.
+    pub(crate) fn invalidate_brick(&mut self, id: BrickId) {
+        if let Some(entry) = self.walk(id, true) {
+            self.set(entry, self.get(entry).stale());
+            return;
+        }
+        // No room to tell this brick from its neighbours: nothing is known of all of them.
+        let mut at = self.tables.directory_index(id);
+        for step in 1..self.tables.shape().depth {
+            let Some(block) = self.get(at).slot() else {
+                break;
+            };
+            at = self.physical(block, self.tables.entry_in_block(id, step));
+        }
+        if self.get(at) == Entry::EMPTY {
+            self.set(at, Entry::UNMAPPED);
+        }
+    }
+
     /// Drops every brick. What is known to be empty stays so.
     pub(crate) fn drop_bricks(&mut self) {
         for slot in 0..self.bricks.capacity() {

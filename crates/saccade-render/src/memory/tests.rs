@@ -17,6 +17,7 @@ enum Op {
     /// A frame that used the bricks of some ids and stumbled on the way to others.
     Report(u32),
     Invalidate(u32),
+    InvalidateBrick(u32),
     Drop,
 }
 
@@ -132,6 +133,13 @@ impl World {
                     let level = &self.levels[id.level() as usize];
                     let stored = id.voxels(level).grown(BRICK_BORDER);
                     said.since_changed |= stored.intersects(level.box_from_voxels(voxels));
+                }
+            }
+            Op::InvalidateBrick(number) => {
+                let id = self.id(number);
+                self.memory.invalidate_brick(id);
+                if let Some(said) = self.said.get_mut(&id) {
+                    said.since_changed = true;
                 }
             }
             Op::Drop => {
@@ -287,6 +295,7 @@ fn op() -> impl Strategy<Value = Op> {
         4 => (0..500_u32).prop_map(Op::PlaceEmpty),
         3 => any::<u32>().prop_map(|n| Op::Report(n % 500)),
         1 => any::<u32>().prop_map(Op::Invalidate),
+        2 => (0..500_u32).prop_map(Op::InvalidateBrick),
         1 => Just(Op::Drop),
     ]
 }
@@ -314,7 +323,8 @@ fn holds_for_a_long_time() {
             // A window over the ids that moves on, as a view does.
             let near = round / 40 + number % 400;
             world.apply(match number % 97 {
-                0..50 => Op::Place(near),
+                0..46 => Op::Place(near),
+                46..50 => Op::InvalidateBrick(near),
                 50..75 => Op::PlaceEmpty(near),
                 75..94 => Op::Report(near),
                 94..96 => Op::Invalidate(number),

@@ -33,10 +33,10 @@ const MOST_DIRTY: usize = 4096;
 
 #[derive(Debug)]
 enum Event {
-    /// A brick's values are known; it may be resident from now on.
+    /// A brick's values are known, if any; it may be resident from now on.
     Brick {
         id: BrickId,
-        values: BrickValues,
+        values: Option<BrickValues>,
         resident: bool,
     },
     /// A brick is no longer resident.
@@ -120,8 +120,8 @@ impl ResidencyOctree {
         BrickValues::of_voxels(stored, [&x.gaps, &y.gaps, &z.gaps])
     }
 
-    /// A brick has become resident.
-    pub(crate) fn insert(&mut self, id: BrickId, values: BrickValues) {
+    /// A brick has become resident. Without values, what is known of it stays as it is.
+    pub(crate) fn insert(&mut self, id: BrickId, values: Option<BrickValues>) {
         self.events.push_back(Event::Brick {
             id,
             values,
@@ -133,7 +133,7 @@ impl ResidencyOctree {
     pub(crate) fn note(&mut self, id: BrickId, values: BrickValues) {
         self.events.push_back(Event::Brick {
             id,
-            values,
+            values: Some(values),
             resident: false,
         });
     }
@@ -184,7 +184,7 @@ impl ResidencyOctree {
                     id,
                     values,
                     resident,
-                }) => self.paint(id, &values, resident),
+                }) => self.paint(id, values.as_ref(), resident),
                 Some(Event::Evicted(id)) => self.evict(id),
                 Some(Event::Changed { .. }) | None => {}
             }
@@ -212,7 +212,7 @@ impl ResidencyOctree {
         self.nodes.flush(upload);
     }
 
-    fn paint(&mut self, id: BrickId, values: &BrickValues, resident: bool) {
+    fn paint(&mut self, id: BrickId, values: Option<&BrickValues>, resident: bool) {
         self.nodes.tick();
         let [x, y, z] = self.geometry.split(id);
         let level = self.geometry.levels[id.level() as usize];
@@ -226,9 +226,10 @@ impl ResidencyOctree {
             }
         }
         // Where all of a brick is alike, larger nodes can tell.
-        let uniform = values.regions.is_none();
+        let uniform = values.is_none_or(|v| v.regions.is_none());
         let aligned = inside.iter().all(|inside| *inside);
         let region = |(index, inside): (usize, &bool)| {
+            let values = values?;
             let values = values.regions.as_ref().map_or(values.whole, |v| v[index]);
             inside.then_some(values)
         };
@@ -246,7 +247,7 @@ impl ResidencyOctree {
             first,
             last,
             regions,
-            whole: values.whole,
+            whole: values.map_or(Values::NONE, |v| v.whole),
         };
         if resident {
             self.resident.insert(id);

@@ -16,6 +16,8 @@ use saccade_core::volume::Volume;
 enum Op {
     /// A brick is delivered and finds a slot.
     Insert(u32),
+    /// Arrives out of date.
+    InsertUnknown(u32),
     /// The values of a brick are known to be between two numbers.
     Note(u32),
     Evict(u32),
@@ -169,9 +171,14 @@ impl World {
             Op::Insert(number) => {
                 let id = self.ids[number as usize % self.ids.len()];
                 let values = self.tree.values_of(id, &self.truth.brick(id));
-                self.tree.insert(id, values);
+                self.tree.insert(id, Some(values));
                 self.resident.insert(id);
                 self.known.insert(id);
+            }
+            Op::InsertUnknown(number) => {
+                let id = self.ids[number as usize % self.ids.len()];
+                self.tree.insert(id, None);
+                self.resident.insert(id);
             }
             Op::Note(number) => {
                 let id = self.ids[number as usize % self.ids.len()];
@@ -387,6 +394,7 @@ impl World {
 fn op() -> impl Strategy<Value = Op> {
     prop_oneof![
         8 => (0..200_u32).prop_map(Op::Insert),
+        2 => (0..200_u32).prop_map(Op::InsertUnknown),
         2 => (0..200_u32).prop_map(Op::Note),
         4 => any::<u32>().prop_map(Op::Evict),
         1 => any::<u32>().prop_map(Op::Change),
@@ -428,7 +436,8 @@ fn holds_for_a_long_time() {
         for round in 0..6000 {
             let number = world.random();
             world.apply(match number % 100 {
-                0..40 => Op::Insert(number / 100),
+                0..34 => Op::Insert(number / 100),
+                34..40 => Op::InsertUnknown(number / 100),
                 40..50 => Op::Note(number / 100),
                 50..80 => Op::Evict(number),
                 80..84 => Op::Change(number),
@@ -486,7 +495,7 @@ fn what_is_alike_is_one_node() {
     let values = world
         .tree
         .values_of(finest[7], &world.truth.brick(finest[7]));
-    world.tree.insert(finest[7], values);
+    world.tree.insert(finest[7], Some(values));
     world.tree.advance(u64::MAX / 2);
     assert!(world.tree.blocks().0 > 2);
 }
@@ -506,7 +515,7 @@ fn bricks_cost_the_same_in_any_volume() {
             let at = UVec3::new(n % 4, n / 4 % 4, n / 16).min(bricks - 1);
             let id = BrickId::new(0, 0, bricks - 1 - at).unwrap();
             let values = tree.values_of(id, &stored);
-            tree.insert(id, values);
+            tree.insert(id, Some(values));
         }
         tree.advance(u64::MAX / 2);
         (tree.visited() / 50, tree.blocks().0, deepest)

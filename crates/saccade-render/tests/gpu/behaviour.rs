@@ -311,6 +311,33 @@ fn changed_bricks_stay_until_their_replacement_comes() {
 }
 
 #[test]
+fn bricks_out_of_date_on_arrival_are_drawn_and_missed_again() {
+    let Some(gpu) = gpu() else { return };
+    let scene = tissue();
+    let view = close_up(&scene);
+    let mut renderer = renderer(&gpu, &scene, RendererOptions::default());
+    settle(&mut renderer, &view, &scene);
+    let right = read(&renderer);
+    renderer.invalidate(VoxelBox::of_size(scene.volume.extent()));
+    let mut missed = frame(&mut renderer, &view).misses;
+    assert!(!missed.is_empty());
+    // Out of date and empty, then out of date with voxels: neither may end the asking.
+    let voxels = vec![200; BRICK_STORED_VOXELS];
+    for content in [BrickVoxels::Empty, BrickVoxels::Voxels(&voxels)] {
+        for &id in &missed {
+            renderer.deliver_outdated(id, content).unwrap();
+        }
+        let report = frame(&mut renderer, &view);
+        assert!(!report.is_complete() && !report.misses.is_empty());
+        assert!(psnr(&read(&renderer), &right) < 40.0, "they are drawn");
+        missed = report.misses;
+    }
+    settle(&mut renderer, &view, &scene);
+    let db = psnr(&read(&renderer), &right);
+    assert!(db > 50.0, "replacements came for all of them: {db} dB");
+}
+
+#[test]
 fn a_working_set_that_does_not_fit_becomes_coarser_and_settles() {
     let Some(gpu) = gpu() else { return };
     let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 0.01)], 100.0);

@@ -45,8 +45,17 @@ fn answer_all(pull: &mut Pull, requests: Vec<Request>, now: Duration) {
 }
 
 fn delivered(pull: &mut Pull, frame: u64) -> Vec<BrickId> {
+    let bricks = delivered_as(pull, frame);
+    bricks.into_iter().map(|(id, _)| id).collect()
+}
+
+fn delivered_as(pull: &mut Pull, frame: u64) -> Vec<(BrickId, Freshness)> {
     let mut bricks = Vec::new();
-    pull.deliver(frame, || ms(0), |id, _| bricks.push(id));
+    pull.deliver(
+        frame,
+        || ms(0),
+        |id, _, freshness| bricks.push((id, freshness)),
+    );
     bricks
 }
 
@@ -277,28 +286,85 @@ fn chunks_of_the_wrong_size_are_failures() {
 }
 
 #[test]
-fn answers_that_began_before_a_change_are_dropped() {
+fn answers_that_began_before_a_change_are_shown_and_asked_for_again() {
     let mut pull = pull(Limits {
         in_flight: 100,
         ..Limits::default()
     });
     pull.want(1, &[brick(3)]);
     let start = pull.plan(ms(0)).start;
-    let changed = VoxelBox::new(UVec3::splat(96), UVec3::splat(97));
-    let cancelled = pull.change(changed);
-    assert_eq!(cancelled.len(), 1, "the brick's own chunk");
+    pull.change(VoxelBox::new(UVec3::splat(96), UVec3::splat(97)));
+    assert!(pull.plan(ms(0)).start.is_empty(), "they are awaited");
     answer_all(&mut pull, start, ms(0));
-    assert!(
-        delivered(&mut pull, 2).is_empty(),
-        "the old answer does not count"
+    assert_eq!(pull.state(brick(3)), BrickState::Ready);
+    assert_eq!(
+        delivered_as(&mut pull, 2),
+        [(brick(3), Freshness::Outdated)]
     );
+
+    pull.want(2, &[brick(3)]);
+    assert_eq!(pull.state(brick(3)), BrickState::Loading);
+    assert!(delivered(&mut pull, 3).is_empty(), "not the same once more");
     let again = pull.plan(ms(0)).start;
     assert_eq!(
         again.iter().map(|r| r.id.chunk).collect::<Vec<_>>(),
-        [UVec3::splat(3)]
+        [UVec3::splat(3)],
+        "the brick's own chunk"
     );
     answer_all(&mut pull, again, ms(0));
-    assert_eq!(delivered(&mut pull, 2), [brick(3)]);
+    assert_eq!(delivered_as(&mut pull, 3), [(brick(3), Freshness::Current)]);
+}
+
+#[test]
+fn neighbours_share_what_is_out_of_date() {
+    let mut pull = pull(Limits {
+        in_flight: 100,
+        ..Limits::default()
+    });
+    pull.want(1, &[brick(3), brick(4)]);
+    let (late, start) = pull
+        .plan(ms(0))
+        .start
+        .into_iter()
+        .partition(|r| r.id.chunk.x == 5);
+    pull.change(VoxelBox::new(UVec3::splat(96), UVec3::splat(97)));
+    answer_all(&mut pull, start, ms(0));
+    assert_eq!(
+        delivered_as(&mut pull, 2),
+        [(brick(3), Freshness::Outdated)]
+    );
+    // Brick 3 is asked for again while brick 4 still waits for its far side.
+    pull.want(2, &[brick(3), brick(4)]);
+    let again = pull.plan(ms(0)).start;
+    assert_eq!(again.len(), 1);
+    answer_all(&mut pull, late, ms(0));
+    assert_eq!(
+        delivered_as(&mut pull, 3),
+        [(brick(4), Freshness::Outdated)]
+    );
+    pull.want(3, &[brick(3), brick(4)]);
+    answer_all(&mut pull, again, ms(0));
+    let both = [
+        (brick(3), Freshness::Current),
+        (brick(4), Freshness::Current),
+    ];
+    assert_eq!(delivered_as(&mut pull, 4), both);
+}
+
+#[test]
+fn a_failure_from_before_a_change_is_no_failure() {
+    let mut pull = pull(Limits {
+        in_flight: 100,
+        ..Limits::default()
+    });
+    pull.want(1, &[brick(3)]);
+    let start = pull.plan(ms(0)).start;
+    pull.change(VoxelBox::of_size(UVec3::splat(256)));
+    for request in start {
+        pull.answer(request.ticket, Err(failed(request.id, false)), ms(0));
+    }
+    assert_eq!(pull.progress().failed, 0);
+    assert_eq!(pull.plan(ms(0)).start.len(), 27, "all are asked for again");
 }
 
 #[test]
@@ -359,7 +425,7 @@ fn a_frame_delivers_within_its_budget() {
     let start = pull.plan(ms(0)).start;
     answer_all(&mut pull, start, ms(0));
     for expected in [(2, true), (2, true), (1, false), (0, false)] {
-        let Delivery { bricks, cut } = pull.deliver(2, || ms(0), |_, _| ());
+        let Delivery { bricks, cut } = pull.deliver(2, || ms(0), |_, _, _| ());
         assert_eq!((bricks, cut), expected);
     }
 }
