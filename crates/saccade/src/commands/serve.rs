@@ -35,12 +35,12 @@ pub(crate) struct At {
     port: u16,
 
     /// Another name by which clients call this server, beside localhost, addresses in numbers and
-    /// this computer's own name; may be given several times
+    /// this computer's own name; may be given several times [default: none]
     #[arg(long, value_name = "NAME")]
     allow_host: Vec<String>,
 
     /// Let only the server's own pages read, and those of this origin, such as
-    /// https://viewer.example; may be given several times. Without it all pages may
+    /// https://viewer.example; may be given several times [default: all pages may]
     #[arg(long, value_name = "ORIGIN")]
     allow_origin: Vec<String>,
 }
