@@ -378,6 +378,27 @@ impl Catalog {
             .map_err(|e| self.failed(e))
     }
 
+    /// The tiles of these ids, by id; those that the volume has not are left out.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    pub async fn tiles(&self, volume: &str, ids: &[TileId]) -> Result<Vec<Tile>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let query = "SELECT id, name, section, width, height, a, b, c, d, tx, ty, pyramid, revision \
+                     FROM tiles WHERE id IN (SELECT value FROM json_each(?)) AND volume = ? \
+                     ORDER BY id";
+        let ids = serde_json::to_string(ids).expect("numbers become JSON");
+        let rows = sqlx::query(query)
+            .bind(ids)
+            .bind(id)
+            .fetch_all(&self.inner.readers)
+            .await;
+        let rows = rows.map_err(|e| self.failed(e))?;
+        let tiles: Result<_, _> = rows.iter().map(rows::tile).collect();
+        tiles.map_err(|e| self.failed(e))
+    }
+
     /// The sections that have a tile, ascending.
     ///
     /// # Errors

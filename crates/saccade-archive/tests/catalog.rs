@@ -12,7 +12,7 @@ use proptest::prelude::*;
 use saccade_archive::acquisition::{Cursor, TileRecord};
 use saccade_archive::catalog::{
     CHANGES_AT_ONCE, Catalog, CatalogChange, CatalogError, ChangeReason, Commit, NewTile,
-    Quarantined, Statistics, TileOutcome, TransformOutcome, Waiting, place,
+    Quarantined, Statistics, TileId, TileOutcome, TransformOutcome, Waiting, place,
 };
 use saccade_archive::{ArchiveError, VisualizationArchive};
 use saccade_core::transform::SectionFromTile;
@@ -329,6 +329,28 @@ fn waiting(tile: &str, section: u32, transform: SectionFromTile, position: u64) 
         record,
         reason: "it ends early".to_owned(),
     }
+}
+
+#[tokio::test]
+async fn tiles_are_found_by_id() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    for (n, name) in (0..).zip(["a", "b", "c", "d"]) {
+        let tile = tile(name, 2, at(0.0, 0.0), n);
+        catalog.commit_tile("v", &tile).await.unwrap();
+    }
+    let all = catalog.section_tiles("v", 2).await.unwrap();
+    let ids = [
+        all[3].id,
+        TileId(-4),
+        all[1].id,
+        TileId(i64::MAX),
+        all[1].id,
+    ];
+    let found = catalog.tiles("v", &ids).await.unwrap();
+    assert_eq!(found, [all[1].clone(), all[3].clone()]);
+    assert_eq!(catalog.tiles("v", &[]).await.unwrap(), []);
+    assert!(catalog.tiles("w", &ids).await.is_err());
 }
 
 #[tokio::test]

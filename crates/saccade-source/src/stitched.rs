@@ -9,7 +9,9 @@
 //! Its sample sits at its centre, `(v + 0.5) * downsampling`.
 //!
 //! - Along z it takes, of the sections within its extent, the one nearest to its centre that has a
-//!   tile there; of two equally near ones the first.
+//!   tile there; of two equally near ones the first. Of the sections with tiles, in that order, the
+//!   first four are looked at, then the 8th, 16th, 32nd and so on: a voxel that spans thousands of
+//!   sections asks a dozen.
 //! - A tile is there if the sample lies in the tile's rectangle (low edges included, high ones not)
 //!   and not in a blank sub-tile. Where several are, the one whose centre is nearest wins, then the
 //!   one that changed last, then the one with the larger id.
@@ -59,7 +61,7 @@ use build::Builder;
 use tiles::Tiles;
 
 pub use error::StitchError;
-pub use index::SectionIndex;
+pub use index::{SectionIndex, TileIndex, TileUpdate};
 
 /// Limits of a [`StitchedSource`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -96,13 +98,15 @@ pub struct StitchedStatistics {
     pub blocks_built: u64,
     /// Voxels of those blocks.
     pub voxels_built: u64,
+    /// Pyramids opened since it was opened, also those opened again.
+    pub pyramids_opened: u64,
     /// Sub-tiles decoded since it was opened.
     pub sub_tiles_decoded: u64,
     /// Memory that finished blocks take \[bytes\].
     pub block_bytes: u64,
-    /// Tiles in the section indices.
+    /// Tiles in the indices of the sections touched so far.
     pub tiles_indexed: u64,
-    /// Memory that the section indices take \[bytes\].
+    /// Memory that these indices take \[bytes\].
     pub section_bytes: u64,
 }
 
@@ -162,8 +166,8 @@ impl StitchedSource {
         if volume.dtype != Dtype::Uint8 || volume.channels.len() != 1 {
             return Err(open_error(StitchError::Kind));
         }
-        let tiles = Tiles::new(archive, &volume, &options);
-        tiles.load_acquired().await.map_err(open_error)?;
+        let index = TileIndex::open(&catalog, name).await.map_err(failed)?;
+        let tiles = Tiles::new(archive, index, &options);
         let inner = Arc::new(Inner {
             grid: BlockGrid::new(&volume),
             blocks: Blocks::new(options.block_bytes),

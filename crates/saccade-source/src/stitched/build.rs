@@ -18,12 +18,15 @@ use super::StitchedStatistics;
 use super::block::{Block, BlockGrid, Failure, Slice};
 use super::coverage::{Candidate, Grid, Segment, Uncovered};
 use super::error::StitchError;
-use super::index::{IndexedTile, SectionIndex};
+use super::index::IndexedTile;
 use super::resample::{Patch, averaged};
 use super::tiles::{Fetched, Tiles};
 
 /// Samples per axis that a voxel larger than any pixel is the mean of, at most: 2^4.
 const FINEST_SAMPLING: u32 = 4;
+/// Of the sections that a voxel spans, all of these nearest ones are looked at; of those behind, ever
+/// fewer.
+const NEAR_SECTIONS: usize = 4;
 /// Sections of a block on which work is under way.
 const SECTIONS_AT_ONCE: usize = 4;
 
@@ -57,13 +60,14 @@ impl Builder {
     }
 
     pub(super) fn statistics(&self) -> StitchedStatistics {
-        let (tiles_indexed, section_bytes) = self.tiles.indexed();
+        let index = self.tiles.index();
         StitchedStatistics {
             blocks_built: self.blocks.load(Ordering::Relaxed),
             voxels_built: self.voxels.load(Ordering::Relaxed),
+            pyramids_opened: self.tiles.opened(),
             sub_tiles_decoded: self.tiles.decoded(),
-            tiles_indexed,
-            section_bytes,
+            tiles_indexed: index.tiles(),
+            section_bytes: index.bytes(),
             ..StitchedStatistics::default()
         }
     }
@@ -71,7 +75,7 @@ impl Builder {
     /// Whether a box of a level's voxels touches a section that has a tile.
     pub(super) fn may_have_data(&self, voxels: VoxelBox, level: u32) -> bool {
         let level0 = self.volume.levels[level as usize].voxels_from_box(voxels);
-        self.tiles.any_acquired(level0.min.z..level0.max.z)
+        self.tiles.index().any_acquired(level0.min.z..level0.max.z)
     }
 
     /// Builds the block of these voxels.
@@ -106,18 +110,32 @@ impl Builder {
         };
         let (min, max) = whole.bounds();
         for section in self.sections_of(level, z) {
-            let index = self.tiles.section(section).await?;
-            let near = near(&index, min, max);
+            let index = self.tiles.index().section(section).await;
+            let index = index.map_err(|source| StitchError::Catalog { source })?;
+            let mut near = index.near(min, max);
             if near.is_empty() {
                 continue;
             }
-            let (grid, uncovered) = planned.take().unwrap_or_else(|| {
-                let by = 1 << sampling(&near, step);
-                let (first, size) = (whole.first * by, whole.size * by);
-                let step = step / f64::from(by);
-                let grid = Grid { first, size, step };
-                (grid, Uncovered::all(&grid))
-            });
+            let (grid, uncovered) = match planned.take() {
+                None => {
+                    let by = 1 << sampling(&near, step);
+                    let (first, size) = (whole.first * by, whole.size * by);
+                    let step = step / f64::from(by);
+                    let grid = Grid { first, size, step };
+                    (grid, Uncovered::all(&grid))
+                }
+                // Coarse levels span many sections, of which the first hides nearly all: only what
+                // may still be seen is opened.
+                Some((grid, uncovered)) => {
+                    let seen = on_rayon(move || {
+                        near.retain(|tile| uncovered.touches(&grid, tile));
+                        (near, uncovered)
+                    });
+                    let uncovered;
+                    (near, uncovered) = seen.await;
+                    (grid, uncovered)
+                }
+            };
             let opened = join_all(near.iter().map(|tile| self.tiles.pyramid(tile))).await;
             let mut candidates = Vec::new();
             for (tile, pyramid) in near.into_iter().zip(opened) {
@@ -179,28 +197,27 @@ impl Builder {
         Ok(sampled.await)
     }
 
-    /// The sections with a tile that voxel `z` of a level spans, the one nearest its centre first.
+    /// The sections with a tile that voxel `z` of a level spans, the one nearest its centre first, as
+    /// far as they are looked at.
     fn sections_of(&self, level: Level, z: u32) -> Vec<u32> {
         let span = level.downsampling.z;
         let z = f64::from(z);
         // Those whose middle lies within the voxel.
         let first = |z: f64| DVec2::splat((z * span - 0.5).ceil().max(0.0)).as_uvec2().x;
-        let mut sections = self.tiles.acquired(first(z)..first(z + 1.0));
+        let mut sections = self.tiles.index().acquired(first(z)..first(z + 1.0));
         let centre = (z + 0.5) * span;
         let distance = |section: &u32| (f64::from(*section) + 0.5 - centre).abs();
         // Stable: of two equally near ones, the first.
         sections.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
-        sections
+        let ranked = (1_usize..).zip(sections);
+        let looked_at = ranked.filter(|(rank, _)| *rank <= NEAR_SECTIONS || rank.is_power_of_two());
+        looked_at.map(|(_, section)| section).collect()
     }
-}
-
-fn near(index: &SectionIndex, min: DVec2, max: DVec2) -> Vec<IndexedTile> {
-    index.touching(min, max).into_iter().cloned().collect()
 }
 
 /// How many times the voxels of `step` level-0 voxels must be halved to be like a pixel of the
 /// coarsest level of every tile.
-fn sampling(tiles: &[IndexedTile], step: DVec2) -> u32 {
+fn sampling(tiles: &[Arc<IndexedTile>], step: DVec2) -> u32 {
     let each = tiles.iter().map(|tile| {
         let coarser = tile
             .wanted_level(step)

@@ -43,14 +43,14 @@ pub(super) struct Segment {
 /// A tile that may be seen.
 #[derive(Clone)]
 pub(super) struct Candidate {
-    pub(super) tile: IndexedTile,
+    pub(super) tile: Arc<IndexedTile>,
     pub(super) pyramid: Arc<Pyramid>,
     /// The level of the pyramid that suits the grid.
     pub(super) level: u32,
 }
 
 impl Candidate {
-    pub(super) fn new(tile: IndexedTile, pyramid: Arc<Pyramid>, grid: &Grid) -> Self {
+    pub(super) fn new(tile: Arc<IndexedTile>, pyramid: Arc<Pyramid>, grid: &Grid) -> Self {
         let level = tile.wanted_level(grid.step).min(tile.coarsest_level());
         Self {
             tile,
@@ -71,36 +71,6 @@ impl Candidate {
     /// How far that position moves from one sample to the next.
     pub(super) fn pixels_along_x(&self, grid: &Grid) -> DVec2 {
         self.tile.tile_from_section.along_x() * grid.step.x / f64::from(1_u32 << self.level)
-    }
-
-    /// The samples of a row that lie in the tile's rectangle.
-    fn row(&self, grid: &Grid, y: u32) -> Range<u32> {
-        let inside = |x| self.tile.contains(self.tile.position(grid.point(x, y)));
-        let first = self.tile.position(grid.point(0, y));
-        let along = self.tile.tile_from_section.along_x() * grid.step.x;
-        let size = self.tile.size.as_dvec2();
-        let width = f64::from(grid.size.x);
-        let (mut low, mut high) = (0.0_f64, width);
-        for (first, along, size) in [(first.x, along.x, size.x), (first.y, along.y, size.y)] {
-            // A row that runs along an edge is judged sample by sample at its ends, below.
-            if along.abs() * width > 1e-9 {
-                let (a, b) = (-first / along, (size - first) / along);
-                (low, high) = (low.max(a.min(b)), high.min(a.max(b)));
-            }
-        }
-        if high < low - 1.0 {
-            return 0..0;
-        }
-        // Rounding may have moved the ends by a sample: the samples themselves decide.
-        let whole = |v: f64| DVec2::splat(v.clamp(0.0, width)).as_uvec2().x;
-        let (mut start, mut end) = (whole(low.floor() - 1.0), whole(high.ceil() + 1.0));
-        while start < end && !inside(start) {
-            start += 1;
-        }
-        while end > start && !inside(end - 1) {
-            end -= 1;
-        }
-        start..end
     }
 
     /// Cuts a row where the tile's pixels are in blank sub-tiles; calls `keep` with the rest.
@@ -174,6 +144,36 @@ impl Candidate {
     }
 }
 
+/// The samples of a row that lie in a tile's rectangle.
+fn row_within(tile: &IndexedTile, grid: &Grid, y: u32) -> Range<u32> {
+    let inside = |x| tile.contains(tile.position(grid.point(x, y)));
+    let first = tile.position(grid.point(0, y));
+    let along = tile.tile_from_section.along_x() * grid.step.x;
+    let size = tile.size.as_dvec2();
+    let width = f64::from(grid.size.x);
+    let (mut low, mut high) = (0.0_f64, width);
+    for (first, along, size) in [(first.x, along.x, size.x), (first.y, along.y, size.y)] {
+        // A row that runs along an edge is judged sample by sample at its ends, below.
+        if along.abs() * width > 1e-9 {
+            let (a, b) = (-first / along, (size - first) / along);
+            (low, high) = (low.max(a.min(b)), high.min(a.max(b)));
+        }
+    }
+    if high < low - 1.0 {
+        return 0..0;
+    }
+    // Rounding may have moved the ends by a sample: the samples themselves decide.
+    let whole = |v: f64| DVec2::splat(v.clamp(0.0, width)).as_uvec2().x;
+    let (mut start, mut end) = (whole(low.floor() - 1.0), whole(high.ceil() + 1.0));
+    while start < end && !inside(start) {
+        start += 1;
+    }
+    while end > start && !inside(end - 1) {
+        end -= 1;
+    }
+    start..end
+}
+
 /// Samples that no tile was found for yet: of each row, what is left.
 pub(super) struct Uncovered {
     rows: Vec<Vec<Range<u32>>>,
@@ -195,6 +195,17 @@ impl Uncovered {
         self.rows.iter().all(Vec::is_empty)
     }
 
+    /// Whether a tile's rectangle holds a sample that is left.
+    pub(super) fn touches(&self, grid: &Grid, tile: &IndexedTile) -> bool {
+        (0..).zip(&self.rows).any(|(y, left)| {
+            let height = grid.point(0, y).y;
+            let row = || row_within(tile, grid, y);
+            let overlaps =
+                |row: Range<u32>| left.iter().any(|l| l.start < row.end && row.start < l.end);
+            !left.is_empty() && tile.min.y <= height && height <= tile.max.y && overlaps(row())
+        })
+    }
+
     /// Gives what is left to the candidates that cover it; returns each one's segments.
     pub(super) fn cover(&mut self, grid: &Grid, candidates: &[Candidate]) -> Vec<Vec<Segment>> {
         let mut segments = vec![Vec::new(); candidates.len()];
@@ -208,7 +219,7 @@ impl Uncovered {
             let height = grid.point(0, y).y;
             for (n, candidate) in candidates.iter().enumerate() {
                 if candidate.tile.min.y <= height && height <= candidate.tile.max.y {
-                    let row = candidate.row(grid, y);
+                    let row = row_within(&candidate.tile, grid, y);
                     if !row.is_empty() {
                         candidate.without_blanks(grid, y, row, |piece| pieces.push((n, piece)));
                     }

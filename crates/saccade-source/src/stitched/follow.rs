@@ -48,8 +48,11 @@ async fn catch_up(
         let Some(inner) = inner.upgrade().filter(|_| !changes.is_empty()) else {
             return Ok(());
         };
+        // First what is known, then what was built of it, then the news: whoever reads after the
+        // news gets neither.
+        inner.builder.tiles().index().apply(&changes).await;
         for change in changes {
-            inner.apply(&change);
+            inner.tell(&change);
             *seen = change.revision;
         }
     }
@@ -57,10 +60,7 @@ async fn catch_up(
 }
 
 impl Inner {
-    /// First what is known, then what was built of it, then the news: whoever reads after the news
-    /// gets neither.
-    fn apply(&self, change: &CatalogChange) {
-        self.builder.tiles().forget(change.section);
+    fn tell(&self, change: &CatalogChange) {
         self.forget(change.voxels);
         self.changes.send(Change {
             revision: change.revision,

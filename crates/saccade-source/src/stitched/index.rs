@@ -1,258 +1,145 @@
-//! Which tiles of a section lie where.
+//! Which tiles lie where.
 
-use std::ops::Range;
-
-use glam::{DVec2, UVec2};
-use saccade_archive::catalog::{Tile, TileId};
-use saccade_archive::pyramid::levels_of;
-use saccade_core::transform::{SectionPoint, TileFromSection, TilePoint};
-
-/// A tile as the stitcher needs it.
-#[derive(Clone, Debug)]
-pub(super) struct IndexedTile {
-    pub(super) id: TileId,
-    pub(super) revision: u64,
-    pub(super) section: u32,
-    /// Pixels of level 0.
-    pub(super) size: UVec2,
-    pub(super) pyramid: Box<str>,
-    pub(super) tile_from_section: TileFromSection,
-    /// In the section \[level-0 voxels\].
-    pub(super) centre: DVec2,
-    /// In the section \[level-0 voxels\].
-    pub(super) min: DVec2,
-    pub(super) max: DVec2,
-}
-
-impl IndexedTile {
-    fn new(tile: &Tile) -> Self {
-        let size = tile.size.as_dvec2();
-        let (min, max) = tile.transform.bounds(size);
-        Self {
-            id: tile.id,
-            revision: tile.revision,
-            section: tile.section,
-            size: tile.size,
-            pyramid: tile.pyramid.as_str().into(),
-            tile_from_section: tile.transform.tile_from_section(),
-            centre: tile.transform.apply(TilePoint(size / 2.0)).0,
-            min: min.0,
-            max: max.0,
-        }
-    }
-
-    /// The position in the tile \[pixels of level 0\] of a position in the section.
-    pub(super) fn position(&self, point: DVec2) -> DVec2 {
-        self.tile_from_section.apply(SectionPoint(point)).0
-    }
-
-    /// Whether a position in the tile is inside its rectangle.
-    pub(super) fn contains(&self, position: DVec2) -> bool {
-        position.cmpge(DVec2::ZERO).all() && position.cmplt(self.size.as_dvec2()).all()
-    }
-
-    /// The pyramid level whose pixels are most like a sample of `step` level-0 voxels in size,
-    /// coarser ones than there are included.
-    pub(super) fn wanted_level(&self, step: DVec2) -> u32 {
-        let (x, y) = (
-            self.tile_from_section.along_x(),
-            self.tile_from_section.along_y(),
-        );
-        let pixels = (x.perp_dot(y) * step.x * step.y).abs().sqrt();
-        let level = pixels.log2().round();
-        // In 0..=64 for every size that is not absurd.
-        #[expect(
-            clippy::cast_possible_truncation,
-            reason = "clamped to small whole numbers; not-a-number becomes 0"
-        )]
-        let level = level.clamp(0.0, 64.0) as u32;
-        level
-    }
-
-    /// The coarsest level its pyramid has.
-    pub(super) fn coarsest_level(&self) -> u32 {
-        let levels = levels_of(self.size.x, self.size.y).len();
-        u32::try_from(levels).map_or(0, |levels| levels.saturating_sub(1))
-    }
-}
-
-/// The tiles of one section on a coarse grid of cells, each of which lists the tiles it touches.
-pub struct SectionIndex {
-    tiles: Vec<IndexedTile>,
-    /// Low corner of cell 0 \[level-0 voxels\].
-    origin: DVec2,
-    cell: DVec2,
-    cells: UVec2,
-    /// Where each cell's tiles begin in `listed`; one more than there are cells.
-    starts: Vec<u32>,
-    listed: Vec<u32>,
-}
-
-impl SectionIndex {
-    /// Of a section's tiles.
-    pub fn new(tiles: &[Tile]) -> Self {
-        let tiles: Vec<_> = tiles.iter().map(IndexedTile::new).collect();
-        let min = tiles.iter().fold(DVec2::INFINITY, |m, t| m.min(t.min));
-        let max = tiles.iter().fold(DVec2::NEG_INFINITY, |m, t| m.max(t.max));
-        let count = u32::try_from(tiles.len()).expect("sections have fewer than 4 G tiles");
-        let mean = tiles.iter().fold(DVec2::ZERO, |s, t| s + (t.max - t.min));
-        let mean = mean / f64::from(count.max(1));
-        let mut index = Self {
-            cells: UVec2::ONE,
-            origin: min,
-            cell: DVec2::ONE,
-            starts: Vec::new(),
-            listed: Vec::new(),
-            tiles,
-        };
-        if count > 0 {
-            // Cells as large as tiles, but never many more cells than tiles.
-            let at_most = f64::from(count).sqrt().ceil() * 2.0;
-            let cells = ((max - min) / mean)
-                .ceil()
-                .clamp(DVec2::ONE, DVec2::splat(at_most));
-            index.cells = cells.as_uvec2();
-            index.cell = (max - min) / cells;
-        }
-        index.list();
-        index
-    }
-
-    fn list(&mut self) {
-        let mut pairs: Vec<(u32, u32)> = Vec::new();
-        for (tile, n) in self.tiles.iter().zip(0..) {
-            let cells = self.touched(tile.min, tile.max);
-            pairs.extend(cells.map(|cell| (cell, n)));
-        }
-        pairs.sort_unstable();
-        let count = self.cells.x * self.cells.y;
-        let first = |cell| pairs.partition_point(|p| p.0 < cell);
-        let starts = (0..=count).map(|cell| u32::try_from(first(cell)));
-        let starts: Result<_, _> = starts.collect();
-        self.starts = starts.expect("tiles touch few cells each");
-        self.listed = pairs.iter().map(|p| p.1).collect();
-    }
-
-    /// Numbers of the cells that a rectangle touches.
-    fn touched(&self, min: DVec2, max: DVec2) -> impl Iterator<Item = u32> + use<> {
-        let last = self.cells - 1;
-        let cell = |p: DVec2| ((p - self.origin) / self.cell).floor().max(DVec2::ZERO);
-        // `as` saturates and then `min` cuts.
-        let (first, end) = (
-            cell(min).as_uvec2().min(last),
-            cell(max).as_uvec2().min(last),
-        );
-        let width = self.cells.x;
-        (first.y..=end.y).flat_map(move |y| (first.x..=end.x).map(move |x| y * width + x))
-    }
-
-    /// The tiles whose bounds touch a rectangle of the section \[level-0 voxels\], by id.
-    pub(super) fn touching(&self, min: DVec2, max: DVec2) -> Vec<&IndexedTile> {
-        if self.tiles.is_empty() {
-            return Vec::new();
-        }
-        let range = |cell: u32| -> Range<usize> {
-            let cell = cell as usize;
-            self.starts[cell] as usize..self.starts[cell + 1] as usize
-        };
-        let cells = self.touched(min, max);
-        let listed = cells.flat_map(|cell| self.listed[range(cell)].iter().copied());
-        let mut numbers: Vec<u32> = listed.collect();
-        numbers.sort_unstable();
-        numbers.dedup();
-        let tiles = numbers.iter().map(|n| &self.tiles[*n as usize]);
-        let touching = |t: &&IndexedTile| t.min.cmple(max).all() && t.max.cmpge(min).all();
-        tiles.filter(touching).collect()
-    }
-
-    /// How many tiles it has.
-    pub fn tiles(&self) -> usize {
-        self.tiles.len()
-    }
-
-    /// Memory it takes \[bytes\].
-    pub fn memory(&self) -> usize {
-        let names: usize = self.tiles.iter().map(|t| t.pyramid.len() + 16).sum();
-        size_of::<Self>()
-            + names
-            + self.tiles.capacity() * size_of::<IndexedTile>()
-            + (self.starts.capacity() + self.listed.capacity()) * size_of::<u32>()
-    }
-}
-
+mod section;
 #[cfg(test)]
-#[allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-    use saccade_core::transform::SectionFromTile;
+mod tests;
+mod tile;
+mod tree;
 
-    fn tile(n: usize, size: UVec2, turn: f64, corner: DVec2) -> Tile {
-        Tile {
-            id: TileId(i64::try_from(n).unwrap()),
-            name: format!("section0003_tile{n:06}"),
-            section: 3,
-            size,
-            transform: SectionFromTile::rotated(size.as_dvec2(), turn, corner),
-            pyramid: format!("tiles/section0003/section0003_tile{n:06}-0123456789abcdef.tif"),
-            revision: 1,
-        }
-    }
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-    fn tiles() -> impl Strategy<Value = Vec<Tile>> {
-        let one = (
-            1..300_u32,
-            1..300_u32,
-            -3.0..3.0,
-            -900.0..900.0,
-            -900.0..900.0,
-        );
-        prop::collection::vec(one, 0..40).prop_map(|all| {
-            let tiles = all.into_iter().enumerate();
-            let tiles = tiles
-                .map(|(n, (w, h, turn, x, y))| tile(n, UVec2::new(w, h), turn, DVec2::new(x, y)));
-            tiles.collect()
+use saccade_archive::catalog::{Catalog, CatalogChange, CatalogError, TileId};
+use tokio::sync::OnceCell;
+
+pub use section::{SectionIndex, TileUpdate};
+pub(super) use tile::IndexedTile;
+
+type Cell = Arc<OnceCell<Arc<SectionIndex>>>;
+
+/// Where the tiles of a volume lie \[000 §5.1\].
+///
+/// Knows from the start which sections have tiles, and loads a section's when it is first asked for.
+/// From then on [`Self::apply`] keeps it as the catalog has it.
+pub struct TileIndex {
+    catalog: Catalog,
+    volume: Box<str>,
+    /// Sections that have a tile.
+    acquired: Mutex<BTreeSet<u32>>,
+    sections: Mutex<BTreeMap<u32, Cell>>,
+}
+
+impl TileIndex {
+    /// Of a volume. Reads which sections have tiles, and nothing of the tiles.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn open(catalog: &Catalog, volume: &str) -> Result<Self, CatalogError> {
+        let acquired = catalog.sections(volume).await?;
+        Ok(Self {
+            catalog: catalog.clone(),
+            volume: volume.into(),
+            acquired: Mutex::new(acquired.into_iter().collect()),
+            sections: Mutex::default(),
         })
     }
 
-    proptest! {
-        #[test]
-        fn finds_what_a_search_through_all_finds(
-            tiles in tiles(),
-            x in -1000.0..1000.0, y in -1000.0..1000.0, w in 0.0..500.0, h in 0.0..500.0,
-        ) {
-            let (min, max) = (DVec2::new(x, y), DVec2::new(x + w, y + h));
-            let index = SectionIndex::new(&tiles);
-            let found: Vec<_> = index.touching(min, max).iter().map(|t| t.id).collect();
-            let all = tiles.iter().filter(|tile| {
-                let (low, high) = tile.transform.bounds(tile.size.as_dvec2());
-                low.0.x <= max.x && low.0.y <= max.y && high.0.x >= min.x && high.0.y >= min.y
+    /// The sections in a range that have a tile, ascending.
+    pub fn acquired(&self, sections: Range<u32>) -> Vec<u32> {
+        lock(&self.acquired).range(sections).copied().collect()
+    }
+
+    /// Whether a section in a range has a tile.
+    pub fn any_acquired(&self, sections: Range<u32>) -> bool {
+        !sections.is_empty() && lock(&self.acquired).range(sections).next().is_some()
+    }
+
+    /// The tiles of a section, loaded on first touch.
+    ///
+    /// # Errors
+    ///
+    /// What the database says; it is asked again the next time.
+    pub async fn section(&self, z: u32) -> Result<Arc<SectionIndex>, CatalogError> {
+        let cell = lock(&self.sections).entry(z).or_default().clone();
+        // A load that was under way when the section changed ends in a cell that nobody asks again.
+        let load = async || {
+            let tiles = self.catalog.section_tiles(&self.volume, z).await?;
+            Ok(Arc::new(SectionIndex::new(&tiles)))
+        };
+        cell.get_or_try_init(load).await.cloned()
+    }
+
+    /// Follows the catalog: what is asked for after this shows these changes.
+    ///
+    /// Reads the tiles that changed. Where that fails, their sections are forgotten, to be loaded when
+    /// they are asked for.
+    pub async fn apply(&self, changes: &[CatalogChange]) {
+        lock(&self.acquired).extend(changes.iter().map(|change| change.section));
+        let mut changed: BTreeMap<u32, BTreeSet<TileId>> = BTreeMap::new();
+        for change in changes {
+            changed
+                .entry(change.section)
+                .or_default()
+                .insert(change.tile);
+        }
+        // Whoever begins to load a section from here on sees the changes.
+        let loading = |z: &u32, cell: &mut Cell| changed.contains_key(z) && !cell.initialized();
+        lock(&self.sections).retain(|z, cell| !loading(z, cell));
+        let ids: BTreeSet<TileId> = changed.values().flatten().copied().collect();
+        let ids: Vec<_> = ids.into_iter().collect();
+        let tiles = match self.catalog.tiles(&self.volume, &ids).await {
+            Ok(tiles) => tiles,
+            Err(error) => {
+                log::warn!("changed tiles cannot be read, their sections are forgotten: {error}");
+                lock(&self.sections).retain(|z, _| !changed.contains_key(z));
+                return;
+            }
+        };
+        let tiles: BTreeMap<_, _> = tiles.iter().map(|tile| (tile.id, tile)).collect();
+        for (z, ids) in changed {
+            let updates = ids.iter().map(|id| match tiles.get(id) {
+                Some(tile) if tile.section == z => TileUpdate::Put(tile),
+                // It lies in another section now, whose change says so.
+                _ => TileUpdate::Remove(*id),
             });
-            let all: Vec<_> = all.map(|t| t.id).collect();
-            prop_assert_eq!(found, all);
+            let loses = { updates.clone() }.any(|update| matches!(update, TileUpdate::Remove(_)));
+            if let Some(cell) = lock(&self.sections).get_mut(&z)
+                && let Some(old) = cell.get()
+            {
+                let index = Arc::new(old.updated(updates));
+                *cell = Arc::new(OnceCell::new_with(Some(index)));
+            }
+            // Hardly ever: the microscope says that a tile is of another section than it said before.
+            if loses && self.section(z).await.is_ok_and(|index| index.tiles() == 0) {
+                lock(&self.acquired).remove(&z);
+            }
         }
     }
 
-    #[test]
-    fn is_small() {
-        for side in [10, 108] {
-            let grid = (0..side).flat_map(|y| (0..side).map(move |x| (x, y)));
-            let tiles: Vec<_> = grid
-                .map(|(x, y)| {
-                    let corner = DVec2::new(f64::from(x), f64::from(y)) * 11_000.0;
-                    tile((y * side + x) as usize, UVec2::splat(12_000), 0.02, corner)
-                })
-                .collect();
-            let bytes = SectionIndex::new(&tiles).memory() / tiles.len();
-            assert!(bytes < 1200, "{bytes} bytes per tile");
-        }
+    /// Tiles of the sections that are loaded.
+    pub fn tiles(&self) -> u64 {
+        self.loaded(|index| index.tiles() as u64)
     }
 
-    #[test]
-    fn one_tile_far_out_costs_nothing() {
-        let near = (0..50).map(|n| tile(n, UVec2::splat(100), 0.0, DVec2::splat(90.0 * n as f64)));
-        let far = tile(50, UVec2::splat(100), 0.0, DVec2::splat(1e15));
-        let tiles: Vec<_> = near.chain([far]).collect();
-        assert!(SectionIndex::new(&tiles).memory() / tiles.len() < 1200);
+    /// Memory that it takes: all that is kept of tiles whose pyramid is not open \[bytes\].
+    pub fn bytes(&self) -> u64 {
+        // Entries of the two trees, which are at least half full.
+        let cell = size_of::<(u32, Cell)>() + size_of::<OnceCell<Arc<SectionIndex>>>() / 2;
+        let sections = 2 * lock(&self.sections).len() * cell;
+        let acquired = 2 * lock(&self.acquired).len() * size_of::<u32>();
+        (size_of::<Self>() + sections + acquired) as u64 + self.loaded(|index| index.bytes() as u64)
     }
+
+    fn loaded(&self, count: impl Fn(&SectionIndex) -> u64) -> u64 {
+        let sections = lock(&self.sections);
+        let loaded = sections.values().filter_map(|cell| cell.get());
+        loaded.map(|index| count(index)).sum()
+    }
+}
+
+/// Every change under these locks is one insertion or removal: whole even after a panic.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -291,3 +291,47 @@ fn unknown_volumes_are_told() {
         }
     });
 }
+
+#[test]
+fn coarse_levels_look_at_few_sections_and_open_few_pyramids() {
+    run(async {
+        const SECTIONS: u32 = 96;
+        let extent = UVec3::new(300, 200, SECTIONS);
+        let mut fixture = Fixture::new(extent, DVec3::splat(4.0)).await;
+        for section in 0..SECTIONS {
+            // Two tiles that leave the right end of the volume free, so that no section covers all.
+            for n in 0..2 {
+                let corner = (f64::from(n) * 90.0, 0.0);
+                let seed = u64::from(section * 2 + n);
+                let tile = tile((100, 190), section, corner, 0.0, 1.0, seed);
+                fixture.put(&format!("s{section}n{n}"), tile).await;
+            }
+        }
+        let source = fixture.open().await;
+        let volume = fixture.volume.clone();
+        let coarsest = volume.levels.len() as u32 - 1;
+        let span = volume.levels[coarsest as usize].downsampling.z as u32;
+        assert!(span >= 16, "voxels span {span} sections");
+        let id = ChunkId {
+            channel: 0,
+            level: coarsest,
+            chunk: UVec3::ZERO,
+        };
+        let got = source.read(id).await.unwrap();
+        let statistics = source.statistics();
+        // Of 16 sections seven at most are looked at; tiles whose every sample is hidden by a nearer
+        // section's are not opened.
+        let slices = u64::from(volume.levels[coarsest as usize].extent.z);
+        assert!(statistics.tiles_indexed <= slices * 7 * 2, "{statistics:?}");
+        assert!(
+            statistics.tiles_indexed < u64::from(SECTIONS * 2),
+            "{statistics:?}"
+        );
+        assert!(statistics.pyramids_opened <= slices * 2, "{statistics:?}");
+        let want = chunk_of(&volume, &fixture.expected(), id);
+        let Chunk::Voxels(got) = got else {
+            panic!("the chunk is empty");
+        };
+        assert!(got.iter().zip(&want).all(|(a, b)| a.abs_diff(*b) <= 1));
+    });
+}

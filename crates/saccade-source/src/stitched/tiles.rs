@@ -1,25 +1,19 @@
 //! What is known of the tiles: indices of sections and of pyramids, decoded sub-tiles.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::ops::Range;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 
+use super::StitchedOptions;
+use super::error::StitchError;
+use super::index::{IndexedTile, TileIndex};
 use bytes::Bytes;
 use futures::future::try_join_all;
 use glam::{DVec2, UVec2};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use saccade_archive::VisualizationArchive;
-use saccade_archive::catalog::Catalog;
 use saccade_archive::pyramid::{PyramidIndex, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_archive::storage::Storage;
-use saccade_core::volume::Volume;
-use tokio::sync::OnceCell;
-
-use super::StitchedOptions;
-use super::error::StitchError;
-use super::index::{IndexedTile, SectionIndex};
 
 /// Bytes that are rather read and thrown away than left out by a further read.
 const GAP: u64 = 16 << 10;
@@ -93,12 +87,8 @@ impl Weighter<Box<str>, Arc<Pyramid>> for Bytewise {
 }
 
 pub(super) struct Tiles {
-    catalog: Catalog,
+    index: TileIndex,
     storage: Arc<dyn Storage>,
-    volume: Box<str>,
-    /// Sections that have, or had, a tile.
-    acquired: Mutex<BTreeSet<u32>>,
-    sections: Mutex<BTreeMap<u32, Arc<OnceCell<Arc<SectionIndex>>>>>,
     pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
     sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
     next_serial: AtomicU64,
@@ -108,7 +98,7 @@ pub(super) struct Tiles {
 impl Tiles {
     pub(super) fn new(
         archive: &VisualizationArchive,
-        volume: &Volume,
+        index: TileIndex,
         options: &StitchedOptions,
     ) -> Self {
         let items = |bytes: u64, each: usize| {
@@ -117,11 +107,8 @@ impl Tiles {
                 .clamp(16, 1 << 20)
         };
         Self {
-            catalog: archive.catalog().clone(),
+            index,
             storage: archive.storage().clone(),
-            volume: volume.name.as_str().into(),
-            acquired: Mutex::default(),
-            sections: Mutex::default(),
             pyramids: Cache::with_weighter(
                 items(options.index_bytes, 64 << 10),
                 options.index_bytes,
@@ -137,41 +124,9 @@ impl Tiles {
         }
     }
 
-    /// Reads which sections have a tile.
-    pub(super) async fn load_acquired(&self) -> Result<(), StitchError> {
-        let sections = self.catalog.sections(&self.volume).await;
-        let sections = sections.map_err(|source| StitchError::Catalog { source })?;
-        lock(&self.acquired).extend(sections);
-        Ok(())
-    }
-
-    /// A section has changed: forgets what is known of it.
-    pub(super) fn forget(&self, section: u32) {
-        lock(&self.acquired).insert(section);
-        lock(&self.sections).remove(&section);
-    }
-
-    /// The sections in a range that have a tile.
-    pub(super) fn acquired(&self, sections: Range<u32>) -> Vec<u32> {
-        lock(&self.acquired).range(sections).copied().collect()
-    }
-
-    /// Whether a section in a range has a tile.
-    pub(super) fn any_acquired(&self, sections: Range<u32>) -> bool {
-        !sections.is_empty() && lock(&self.acquired).range(sections).next().is_some()
-    }
-
-    /// The index of a section, loaded on first touch.
-    ///
-    /// A load that was under way when the section changed ends in a cell that nobody asks again.
-    pub(super) async fn section(&self, z: u32) -> Result<Arc<SectionIndex>, StitchError> {
-        let cell = lock(&self.sections).entry(z).or_default().clone();
-        let load = async || {
-            let tiles = self.catalog.section_tiles(&self.volume, z).await;
-            let tiles = tiles.map_err(|source| StitchError::Catalog { source })?;
-            Ok(Arc::new(SectionIndex::new(&tiles)))
-        };
-        cell.get_or_try_init(load).await.cloned()
+    /// Where they lie.
+    pub(super) fn index(&self) -> &TileIndex {
+        &self.index
     }
 
     /// The pyramid of a tile, opened if it is not open.
@@ -264,13 +219,9 @@ impl Tiles {
         self.decoded.load(Ordering::Relaxed)
     }
 
-    /// Tiles in the section indices, and their memory \[bytes\].
-    pub(super) fn indexed(&self) -> (u64, u64) {
-        let sections = lock(&self.sections);
-        let loaded = sections.values().filter_map(|cell| cell.get());
-        loaded.fold((0, 0), |(tiles, bytes), index| {
-            (tiles + index.tiles() as u64, bytes + index.memory() as u64)
-        })
+    /// Pyramids opened so far.
+    pub(super) fn opened(&self) -> u64 {
+        self.next_serial.load(Ordering::Relaxed)
     }
 }
 
@@ -280,9 +231,4 @@ fn key(pyramid: &Pyramid, level: u32, at: UVec2) -> SubTileKey {
         level,
         at,
     }
-}
-
-/// Every change under these locks is one insertion or removal: whole even after a panic.
-fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -153,6 +153,12 @@ pub(super) fn stitch(tiles: &BTreeMap<i64, RawTile>, extent: [u32; 3], down: [f6
         sections.retain(|s| f64::from(*s) + 0.5 >= low && f64::from(*s) + 0.5 < high);
         let off = |s: &u32| (f64::from(*s) + 0.5 - middle).abs();
         sections.sort_by(|a, b| off(a).partial_cmp(&off(b)).unwrap().then(a.cmp(b)));
+        // The nearest four are looked at, then the 8th, 16th, ...
+        let sections: Vec<u32> = (1_u32..)
+            .zip(sections)
+            .filter(|(n, _)| *n <= 4 || n.count_ones() == 1)
+            .map(|(_, s)| s)
+            .collect();
         let sections: Vec<Vec<_>> = sections.iter().map(|s| of_section(*s).collect()).collect();
         for y in 0..extent[1] {
             for x in 0..extent[0] {

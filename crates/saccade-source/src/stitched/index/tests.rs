@@ -1,0 +1,319 @@
+use std::collections::BTreeMap;
+
+use glam::{DVec2, DVec3, UVec2, UVec3};
+use proptest::prelude::*;
+use saccade_archive::catalog::{Catalog, NewTile, Tile, TileId};
+use saccade_core::transform::{SectionFromTile, SectionPoint};
+use saccade_core::volume::Volume;
+
+use super::{SectionIndex, TileIndex, TileUpdate};
+
+fn tile(n: u32, size: UVec2, turn: f64, corner: DVec2) -> Tile {
+    Tile {
+        id: TileId(n.into()),
+        name: format!("section0003_tile{n:06}"),
+        section: 3,
+        size,
+        transform: SectionFromTile::rotated(size.as_dvec2(), turn, corner),
+        pyramid: format!("tiles/section0003/section0003_tile{n:06}-0123456789abcdef.tif"),
+        revision: 1,
+    }
+}
+
+/// Size, turn and corner.
+type Place = (u32, u32, f64, f64, f64);
+
+fn place() -> impl Strategy<Value = Place> {
+    (
+        1..300_u32,
+        1..300_u32,
+        -3.0..3.0,
+        -900.0..900.0,
+        -900.0..900.0,
+    )
+}
+
+fn placed(n: u32, (w, h, turn, x, y): Place) -> Tile {
+    tile(n, UVec2::new(w, h), turn, DVec2::new(x, y))
+}
+
+/// A rectangle, as corner and size.
+fn rectangles() -> impl Strategy<Value = Vec<(f64, f64, f64, f64)>> {
+    let one = (-1000.0..1000.0, -1000.0..1000.0, 0.0..500.0, 0.0..500.0);
+    prop::collection::vec(one, 1..6)
+}
+
+/// What a search through all tiles finds.
+fn search<'t>(tiles: impl Iterator<Item = &'t Tile>, min: DVec2, max: DVec2) -> Vec<TileId> {
+    let touching = tiles.filter(|tile| {
+        let (low, high) = tile.transform.bounds(tile.size.as_dvec2());
+        low.0.x <= max.x && low.0.y <= max.y && high.0.x >= min.x && high.0.y >= min.y
+    });
+    let mut ids: Vec<_> = touching.map(|tile| tile.id).collect();
+    ids.sort_unstable();
+    ids
+}
+
+fn same(
+    index: &SectionIndex,
+    tiles: &BTreeMap<TileId, Tile>,
+    rectangles: &[(f64, f64, f64, f64)],
+) -> Result<(), TestCaseError> {
+    prop_assert_eq!(index.tiles(), tiles.len());
+    for (x, y, w, h) in rectangles {
+        let (min, max) = (DVec2::new(*x, *y), DVec2::new(x + w, y + h));
+        let found = index.touching(SectionPoint(min), SectionPoint(max));
+        prop_assert_eq!(found, search(tiles.values(), min, max));
+    }
+    Ok(())
+}
+
+#[derive(Clone, Debug)]
+enum Step {
+    /// New, moved or imaged again with another size.
+    Put(u32, Place),
+    /// News that came late.
+    Late(u32, Place),
+    Remove(u32),
+}
+
+fn steps() -> impl Strategy<Value = Vec<Vec<Step>>> {
+    let id = || 0..300_u32;
+    let step = prop_oneof![
+        6 => (id(), place()).prop_map(|(n, place)| Step::Put(n, place)),
+        1 => (id(), place()).prop_map(|(n, place)| Step::Late(n, place)),
+        3 => id().prop_map(Step::Remove),
+    ];
+    prop::collection::vec(prop::collection::vec(step, 1..40), 1..12)
+}
+
+proptest! {
+    #[test]
+    fn finds_what_a_search_through_all_finds(
+        places in prop::collection::vec(place(), 0..400),
+        rectangles in rectangles(),
+    ) {
+        let tiles: Vec<_> = (0..).zip(places).map(|(n, place)| placed(n, place)).collect();
+        let index = SectionIndex::new(&tiles);
+        let tiles = tiles.into_iter().map(|tile| (tile.id, tile)).collect();
+        same(&index, &tiles, &rectangles)?;
+    }
+
+    #[test]
+    fn updated_is_like_new(
+        places in prop::collection::vec(place(), 0..300),
+        steps in steps(),
+        rectangles in rectangles(),
+    ) {
+        let first: Vec<_> = (0..).zip(places).map(|(n, place)| placed(n, place)).collect();
+        let mut index = SectionIndex::new(&first);
+        let mut tiles: BTreeMap<_, _> = first.into_iter().map(|tile| (tile.id, tile)).collect();
+        let mut revision = 1;
+        for batch in steps {
+            let before = (index.clone(), tiles.clone());
+            let mut news = Vec::new();
+            for step in batch {
+                revision += 1;
+                match step {
+                    Step::Put(n, place) => {
+                        let tile = Tile { revision, ..placed(n, place) };
+                        tiles.insert(tile.id, tile.clone());
+                        news.push(Ok(tile));
+                    }
+                    Step::Late(n, place) => {
+                        let tile = Tile { revision: 0, ..placed(n, place) };
+                        if tiles.contains_key(&tile.id) {
+                            news.push(Ok(tile));
+                        }
+                    }
+                    Step::Remove(n) => {
+                        tiles.remove(&TileId(n.into()));
+                        news.push(Err(TileId(n.into())));
+                    }
+                }
+            }
+            let updates = news.iter().map(|news| match news {
+                Ok(tile) => TileUpdate::Put(tile),
+                Err(id) => TileUpdate::Remove(*id),
+            });
+            index = index.updated(updates);
+            same(&index, &tiles, &rectangles)?;
+            same(&before.0, &before.1, &rectangles)?;
+            prop_assert!(index.hidden.len() + index.recent.len() <= index.most_changes());
+        }
+    }
+}
+
+#[test]
+fn a_tile_takes_few_bytes() {
+    for side in [10, 108] {
+        let grid = (0..side).flat_map(|y| (0..side).map(move |x| (x, y)));
+        let place = |(x, y): (u32, u32)| {
+            let corner = DVec2::new(f64::from(x), f64::from(y)) * 11_000.0;
+            tile(y * side + x, UVec2::splat(12_000), 0.02, corner)
+        };
+        let tiles: Vec<_> = grid.map(place).collect();
+        let bytes = SectionIndex::new(&tiles).bytes() / tiles.len();
+        assert!(bytes < 400, "{bytes} bytes per tile");
+        // Also while it grows tile by tile.
+        let grown = tiles
+            .chunks(7)
+            .fold(SectionIndex::new(&[]), |index, tiles| {
+                index.updated(tiles.iter().map(TileUpdate::Put))
+            });
+        let bytes = grown.bytes() / tiles.len();
+        assert!(bytes < 400, "{bytes} bytes per tile");
+    }
+}
+
+#[test]
+fn one_tile_far_out_costs_nothing() {
+    let near = (0..50).map(|n| tile(n, UVec2::splat(100), 0.0, DVec2::splat(f64::from(n) * 90.0)));
+    let far = tile(50, UVec2::splat(100), 0.0, DVec2::splat(1e15));
+    let tiles: Vec<_> = near.chain([far]).collect();
+    assert!(SectionIndex::new(&tiles).bytes() / tiles.len() < 400);
+}
+
+/// A catalog, and a name of a volume in it.
+async fn catalog(folder: &tempfile::TempDir) -> Catalog {
+    let catalog = Catalog::create(&folder.path().join("catalog.sqlite"))
+        .await
+        .unwrap();
+    let volume = Volume::new("v", UVec3::new(2000, 2000, 9), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+    catalog.create_volume(&volume).await.unwrap();
+    catalog
+}
+
+fn new_tile(name: &str, section: u32, corner: f64, position: u64) -> NewTile {
+    NewTile {
+        name: name.into(),
+        section,
+        size: UVec2::new(300, 200),
+        transform: SectionFromTile::rotated(DVec2::new(300.0, 200.0), 0.1, DVec2::splat(corner)),
+        pyramid: format!("tiles/{name}-{position}.tif"),
+        position,
+    }
+}
+
+const ALL: (SectionPoint, SectionPoint) = (
+    SectionPoint(DVec2::splat(f64::NEG_INFINITY)),
+    SectionPoint(DVec2::splat(f64::INFINITY)),
+);
+
+/// Tiles of each section, as two indices have them.
+async fn compare(kept: &TileIndex, catalog: &Catalog) {
+    let fresh = TileIndex::open(catalog, "v").await.unwrap();
+    for z in 0..9 {
+        let (kept, fresh) = (
+            kept.section(z).await.unwrap(),
+            fresh.section(z).await.unwrap(),
+        );
+        let of = |index: &SectionIndex| {
+            let near = index.near(ALL.0.0, ALL.1.0);
+            let facts = near
+                .iter()
+                .map(|t| (t.id, t.revision, t.centre, t.pyramid.clone()));
+            facts.collect::<Vec<_>>()
+        };
+        assert_eq!(of(&kept), of(&fresh), "section {z}");
+    }
+}
+
+#[tokio::test]
+async fn follows_the_catalog() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(&folder).await;
+    for n in 0..6 {
+        let tile = new_tile(&format!("t{n}"), n % 3, 100.0 * f64::from(n), u64::from(n));
+        catalog.commit_tile("v", &tile).await.unwrap();
+    }
+    let index = TileIndex::open(&catalog, "v").await.unwrap();
+    assert_eq!(index.acquired(0..9), [0, 1, 2]);
+    assert_eq!(
+        (index.tiles(), index.any_acquired(3..9)),
+        (0, false),
+        "nothing is loaded"
+    );
+    let held = index.section(1).await.unwrap();
+    let mut seen = catalog.revision("v").await.unwrap();
+    let moved = SectionFromTile::translation(DVec2::splat(700.0));
+    for step in 0..8 {
+        match step {
+            // Imaged again, in place and in another section that is loaded, or not, or new.
+            0 => drop(
+                catalog
+                    .commit_tile("v", &new_tile("t1", 1, 130.0, 20))
+                    .await
+                    .unwrap(),
+            ),
+            1 => drop(
+                catalog
+                    .commit_tile("v", &new_tile("t4", 2, 0.0, 21))
+                    .await
+                    .unwrap(),
+            ),
+            2 => drop(
+                catalog
+                    .commit_tile("v", &new_tile("t2", 1, 5.0, 22))
+                    .await
+                    .unwrap(),
+            ),
+            3 => drop(
+                catalog
+                    .commit_tile("v", &new_tile("t3", 7, 5.0, 23))
+                    .await
+                    .unwrap(),
+            ),
+            // Moved, near and far; a new one.
+            4 => drop(catalog.set_transform("v", "t1", moved).await.unwrap()),
+            5 => drop(catalog.set_transform("v", "t5", moved).await.unwrap()),
+            6 => drop(
+                catalog
+                    .commit_tile("v", &new_tile("t0", 8, 5.0, 24))
+                    .await
+                    .unwrap(),
+            ),
+            _ => drop(
+                catalog
+                    .commit_tile("v", &new_tile("t9", 1, 900.0, 25))
+                    .await
+                    .unwrap(),
+            ),
+        }
+        let changes = catalog.changes_after("v", seen).await.unwrap();
+        assert!(!changes.is_empty(), "step {step} changes something");
+        index.apply(&changes).await;
+        seen = changes[changes.len() - 1].revision;
+        compare(&index, &catalog).await;
+    }
+    assert_eq!(
+        index.acquired(0..9),
+        [1, 2, 7, 8],
+        "section 0 has lost its tiles"
+    );
+    assert_eq!(held.tiles(), 2, "whoever holds an index keeps it");
+    assert!(index.bytes() > 200 * index.tiles(), "the tiles count");
+}
+
+#[tokio::test]
+async fn a_catalog_that_cannot_be_read_leaves_nothing_stale() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(&folder).await;
+    catalog
+        .commit_tile("v", &new_tile("a", 4, 0.0, 1))
+        .await
+        .unwrap();
+    let index = TileIndex::open(&catalog, "v").await.unwrap();
+    assert_eq!(index.section(4).await.unwrap().tiles(), 1);
+    catalog
+        .commit_tile("v", &new_tile("b", 4, 300.0, 2))
+        .await
+        .unwrap();
+    let changes = catalog.changes_after("v", 1).await.unwrap();
+    catalog.close().await;
+    index.apply(&changes).await;
+    assert!(
+        index.section(4).await.is_err(),
+        "asked again, not answered from before"
+    );
+}
