@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use glam::UVec3;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{Dtype, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use serde::{Deserialize, Serialize};
 
@@ -182,8 +182,34 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
         0
     }
 
-    /// Bounds of a chunk's measured values, if they are known without reading voxels.
+    /// Bounds of a chunk's measured values, if they are at hand.
     fn value_range(&self, _id: ChunkId) -> Option<ValueRange> {
         None
+    }
+
+    /// Bounds of a chunk's measured values, looked up without building the chunk: what cannot be seen
+    /// need not be read. They hold, and may be wider than they need be; `None` where nothing was
+    /// acquired.
+    ///
+    /// A source that knows nothing says what fits its type.
+    ///
+    /// # Errors
+    ///
+    /// [`ChunkError`], of the future.
+    fn find_value_range(
+        &self,
+        id: ChunkId,
+    ) -> BoxFuture<'_, Result<Option<ValueRange>, ChunkError>> {
+        let found = match id.voxels(self.volume()) {
+            None => Err(ChunkError::OutOfRange { id }),
+            Some(_) => Ok(Some(self.value_range(id).unwrap_or(ValueRange {
+                min: 1,
+                max: match self.volume().dtype {
+                    Dtype::Uint8 => u16::from(u8::MAX),
+                    _ => u16::MAX,
+                },
+            }))),
+        };
+        Box::pin(std::future::ready(found))
     }
 }

@@ -44,6 +44,7 @@ mod tiles;
 use std::sync::Arc;
 use std::time::Duration;
 
+use glam::UVec2;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::CatalogError;
 use saccade_core::volume::{Dtype, Volume};
@@ -62,6 +63,7 @@ use tiles::Tiles;
 
 pub use error::StitchError;
 pub use index::{SectionIndex, TileIndex, TileUpdate};
+pub use resample::Patch;
 
 /// Limits of a [`StitchedSource`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -108,6 +110,15 @@ pub struct StitchedStatistics {
     pub tiles_indexed: u64,
     /// Memory that these indices take \[bytes\].
     pub section_bytes: u64,
+}
+
+/// A piece of one z of a level, see [`StitchedSource::cross_section`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CrossSection {
+    /// Voxels along x and y.
+    pub size: UVec2,
+    /// Their values, x fastest.
+    pub values: Vec<u8>,
 }
 
 /// A volume of an archive, stitched on demand.
@@ -182,6 +193,40 @@ impl StitchedSource {
         Ok(Self { inner, follower })
     }
 
+    /// Where its tiles lie.
+    pub fn index(&self) -> &TileIndex {
+        self.inner.builder.tiles().index()
+    }
+
+    /// One z of a level, cut out at `min` and `size` voxels large, x fastest; `None` where nothing was
+    /// acquired. Built alone, and not kept: a picture of a plane costs a plane, not a block. Voxels
+    /// past the level's end are left out.
+    ///
+    /// # Errors
+    ///
+    /// [`StitchError`] if a tile that is seen cannot be read.
+    ///
+    /// # Panics
+    ///
+    /// If the volume has no such level.
+    pub async fn cross_section(
+        &self,
+        level: u32,
+        z: u32,
+        min: UVec2,
+        size: UVec2,
+    ) -> Result<Option<CrossSection>, Arc<StitchError>> {
+        let extent = self.inner.volume.levels[level as usize].extent;
+        let max = min.saturating_add(size).min(extent.truncate());
+        let voxels = VoxelBox::new(min.extend(z), max.extend(z.saturating_add(1).min(extent.z)));
+        if voxels.is_empty() {
+            return Ok(None);
+        }
+        let values = self.inner.builder.cross_section(voxels, level).await?;
+        let size = voxels.size().truncate();
+        Ok(values.map(|values| CrossSection { size, values }))
+    }
+
     /// What it holds and has done.
     pub fn statistics(&self) -> StitchedStatistics {
         let mut statistics = self.inner.builder.statistics();
@@ -208,15 +253,11 @@ impl VolumeSource for StitchedSource {
             {
                 return Ok(Chunk::Empty);
             }
-            let failed = |source: Arc<StitchError>| ChunkError::Failed {
-                id,
-                transient: source.is_transient(),
-                source,
-            };
-            match self.inner.block(key).await.map_err(failed)?.chunk(chunk) {
+            let block = self.inner.block(key).await;
+            match block.map_err(|source| failed(id, source))?.chunk(chunk) {
                 CutChunk::Empty => Ok(Chunk::Empty),
                 CutChunk::Voxels(bytes, _) => Ok(Chunk::Voxels(bytes.clone())),
-                CutChunk::Failed(error) => Err(failed(error.clone())),
+                CutChunk::Failed(error) => Err(failed(id, error.clone())),
             }
         })
     }
@@ -229,7 +270,7 @@ impl VolumeSource for StitchedSource {
         self.inner.changes.revision()
     }
 
-    /// Known of chunks that were built and are still held.
+    /// Known of chunks that were built and are still held; see [`Self::find_value_range`] for others.
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
         id.voxels(&self.inner.volume)?;
         let (key, chunk) = self.inner.grid.block_of(id);
@@ -237,6 +278,32 @@ impl VolumeSource for StitchedSource {
             CutChunk::Voxels(_, range) => Some(*range),
             CutChunk::Empty | CutChunk::Failed(_) => None,
         }
+    }
+
+    /// Of chunks that were not built, the bounds of the sub-tiles below them: opens pyramids, decodes
+    /// nothing.
+    fn find_value_range(
+        &self,
+        id: ChunkId,
+    ) -> BoxFuture<'_, Result<Option<ValueRange>, ChunkError>> {
+        Box::pin(async move {
+            let Some(voxels) = id.voxels(&self.inner.volume) else {
+                return Err(ChunkError::OutOfRange { id });
+            };
+            if let Some(range) = self.value_range(id) {
+                return Ok(Some(range));
+            }
+            let found = self.inner.builder.range(voxels, id.level).await;
+            found.map_err(|source| failed(id, Arc::new(source)))
+        })
+    }
+}
+
+fn failed(id: ChunkId, source: Arc<StitchError>) -> ChunkError {
+    ChunkError::Failed {
+        id,
+        transient: source.is_transient(),
+        source,
     }
 }
 

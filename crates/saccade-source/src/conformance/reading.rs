@@ -6,10 +6,11 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
 use super::{Oracle, Violation, compare, ensure, read_bytes, violation};
-use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
+use crate::{Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
 
 /// Chunks of a level and channel that are looked at; larger levels are sampled.
 const CHUNKS_PER_LEVEL: u64 = 96;
+const NOTHING: &str = "say that nothing was acquired only where nothing was";
 
 /// The description of a volume makes sense. Sources that get theirs from outside check it so.
 ///
@@ -87,7 +88,12 @@ pub async fn check_reading(
         let got = read_bytes(source, *id).await?;
         check_padding(&volume, *id, &got)?;
         compare(source, *id, &got, &oracle(*id), tolerance)?;
-        check_range(source, *id, &got)?;
+        check_range(source, *id, &got, source.value_range(*id))?;
+        match source.find_value_range(*id).await {
+            Ok(None) => ensure(got.iter().all(|v| *v == 0), NOTHING, || id.to_string())?,
+            Ok(found) => check_range(source, *id, &got, found)?,
+            Err(error) => return Err(violation("find bounds of what it can read", error)),
+        }
         serial.push(got);
     }
 
@@ -142,6 +148,13 @@ async fn check_out_of_range(source: &dyn VolumeSource) -> Result<(), Violation> 
             "know no values of chunks that do not exist",
             || outside.to_string(),
         )?;
+        let found = source.find_value_range(*outside).await;
+        let refused = matches!(found, Err(ChunkError::OutOfRange { .. }));
+        ensure(
+            refused,
+            "find no values of chunks that do not exist",
+            || outside.to_string(),
+        )?;
     }
     Ok(())
 }
@@ -171,8 +184,13 @@ fn check_padding(volume: &Volume, id: ChunkId, got: &[u8]) -> Result<(), Violati
     Ok(())
 }
 
-fn check_range(source: &dyn VolumeSource, id: ChunkId, got: &[u8]) -> Result<(), Violation> {
-    let Some(range) = source.value_range(id) else {
+fn check_range(
+    source: &dyn VolumeSource,
+    id: ChunkId,
+    got: &[u8],
+    range: Option<ValueRange>,
+) -> Result<(), Violation> {
+    let Some(range) = range else {
         return Ok(());
     };
     let value = |bytes: &[u8]| bytes.iter().rev().fold(0, |v, b| v << 8 | u16::from(*b));

@@ -25,6 +25,8 @@ enum Wrong {
     Shifted,
     Unbounded,
     Range,
+    Nowhere,
+    Found,
     Stale,
     Backwards,
     PartlyMissed,
@@ -87,6 +89,22 @@ impl VolumeSource for WrongSource {
         range.max -= u16::from(self.wrong == Wrong::Range);
         Some(range)
     }
+
+    fn find_value_range(
+        &self,
+        id: ChunkId,
+    ) -> BoxFuture<'_, Result<Option<ValueRange>, ChunkError>> {
+        Box::pin(async move {
+            let mut found = self.inner.find_value_range(id).await;
+            match (self.wrong, &mut found) {
+                (Wrong::Nowhere, Ok(found)) => *found = None,
+                (Wrong::Found, Ok(Some(found))) => found.min += 1,
+                (Wrong::Unbounded, Err(_)) => return Ok(None),
+                _ => {}
+            }
+            found
+        })
+    }
 }
 
 fn outcome(wrong: Wrong) -> Result<(), Violation> {
@@ -128,6 +146,11 @@ fn wrong_sources_do_not() {
         (Wrong::Shifted, "deliver the right voxels"),
         (Wrong::Unbounded, "refuse chunks that do not exist"),
         (Wrong::Range, "give bounds that hold"),
+        (Wrong::Found, "give bounds that hold"),
+        (
+            Wrong::Nowhere,
+            "say that nothing was acquired only where nothing was",
+        ),
         (Wrong::Stale, "deliver the right voxels"),
         (Wrong::Backwards, "tell changes in order of revision"),
         (

@@ -113,6 +113,10 @@ impl Failure {
         }
     }
 
+    pub(super) fn error(&self) -> Arc<StitchError> {
+        self.error.clone()
+    }
+
     fn touches(&self, min: UVec2, max: UVec2) -> bool {
         self.min.cmplt(max).all() && self.max.cmpgt(min).all()
     }

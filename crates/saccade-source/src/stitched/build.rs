@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use futures::future::join_all;
+use futures::future::{join_all, try_join_all};
 use futures::stream::{self, StreamExt, TryStreamExt};
 use glam::{DVec2, UVec2};
 use rayon::prelude::*;
@@ -21,6 +21,7 @@ use super::error::StitchError;
 use super::index::IndexedTile;
 use super::resample::{Patch, averaged};
 use super::tiles::{Fetched, Tiles};
+use crate::ValueRange;
 
 /// Samples per axis that a voxel larger than any pixel is the mean of, at most: 2^4.
 const FINEST_SAMPLING: u32 = 4;
@@ -96,32 +97,103 @@ impl Builder {
         Ok(block)
     }
 
+    /// Bounds of the values in a box of a level's voxels: of the sub-tiles below it, none of which is
+    /// read. `None` where nothing is.
+    pub(super) async fn range(
+        &self,
+        voxels: VoxelBox,
+        level: u32,
+    ) -> Result<Option<ValueRange>, StitchError> {
+        let level = self.volume.levels[level as usize];
+        let slices = (voxels.min.z..voxels.max.z).map(|z| self.range_of_slice(level, voxels, z));
+        let ranges = stream::iter(slices).buffered(SECTIONS_AT_ONCE);
+        let ranges: Vec<_> = ranges.try_collect().await?;
+        let range = ranges.into_iter().flatten().reduce(union);
+        // What is measured is at least 1.
+        Ok(range.map(|(least, most)| ValueRange {
+            min: u16::from(least.max(1)),
+            max: u16::from(most),
+        }))
+    }
+
+    async fn range_of_slice(
+        &self,
+        level: Level,
+        voxels: VoxelBox,
+        z: u32,
+    ) -> Result<Option<(u8, u8)>, StitchError> {
+        let whole = Grid::of_level(level, voxels);
+        let (min, max) = whole.bounds();
+        let mut planned: Option<Grid> = None;
+        let mut range = None;
+        for section in self.sections_of(level, z) {
+            let near = self.near(section, min, max).await?;
+            if near.is_empty() {
+                continue;
+            }
+            let grid =
+                *planned.get_or_insert_with(|| whole.finer(1 << sampling(&near, whole.step)));
+            let opened = near.iter().map(|tile| self.tiles.pyramid(tile));
+            let mut covered = false;
+            for (tile, pyramid) in near.iter().zip(try_join_all(opened).await?) {
+                let candidate = Candidate::new(tile.clone(), pyramid, &grid);
+                let (seen, whole) = candidate.range(&grid);
+                range = range.into_iter().chain(seen).reduce(union);
+                covered |= whole;
+            }
+            // Other sections are hidden.
+            if covered {
+                break;
+            }
+        }
+        Ok(range)
+    }
+
+    /// The tiles of a section whose bounds touch a rectangle \[level-0 voxels\].
+    async fn near(
+        &self,
+        section: u32,
+        min: DVec2,
+        max: DVec2,
+    ) -> Result<Vec<Arc<IndexedTile>>, StitchError> {
+        let index = self.tiles.index().section(section).await;
+        let index = index.map_err(|source| StitchError::Catalog { source })?;
+        Ok(index.near(min, max))
+    }
+
+    /// Stitches one z of some voxels of a level, without those around it.
+    pub(super) async fn cross_section(
+        &self,
+        voxels: VoxelBox,
+        level: u32,
+    ) -> Result<Option<Vec<u8>>, Arc<StitchError>> {
+        let level = self.volume.levels[level as usize];
+        let slice = self
+            .slice(level, voxels, voxels.min.z)
+            .await
+            .map_err(Arc::new)?;
+        match slice.failures.first() {
+            Some(failure) => Err(failure.error()),
+            None => Ok(slice.values),
+        }
+    }
+
     /// Stitches one z of a block.
     async fn slice(&self, level: Level, voxels: VoxelBox, z: u32) -> Result<Slice, StitchError> {
         let size = voxels.size().truncate();
-        let step = level.downsampling.truncate();
         let mut planned: Option<(Grid, Uncovered)> = None;
         let mut parts = Vec::new();
         let mut failures = Vec::new();
-        let whole = Grid {
-            first: voxels.min.truncate(),
-            size,
-            step,
-        };
+        let whole = Grid::of_level(level, voxels);
         let (min, max) = whole.bounds();
         for section in self.sections_of(level, z) {
-            let index = self.tiles.index().section(section).await;
-            let index = index.map_err(|source| StitchError::Catalog { source })?;
-            let mut near = index.near(min, max);
+            let mut near = self.near(section, min, max).await?;
             if near.is_empty() {
                 continue;
             }
             let (grid, uncovered) = match planned.take() {
                 None => {
-                    let by = 1 << sampling(&near, step);
-                    let (first, size) = (whole.first * by, whole.size * by);
-                    let step = step / f64::from(by);
-                    let grid = Grid { first, size, step };
+                    let grid = whole.finer(1 << sampling(&near, whole.step));
                     (grid, Uncovered::all(&grid))
                 }
                 // Coarse levels span many sections, of which the first hides nearly all: only what
@@ -227,6 +299,11 @@ fn sampling(tiles: &[Arc<IndexedTile>], step: DVec2) -> u32 {
     each.max().unwrap_or(0)
 }
 
+/// Bounds of both.
+fn union(a: (u8, u8), b: (u8, u8)) -> (u8, u8) {
+    (a.0.min(b.0), a.1.max(b.1))
+}
+
 fn cover(
     grid: &Grid,
     mut uncovered: Uncovered,
@@ -257,7 +334,7 @@ fn draw(
         Ok((at, voxels))
     };
     let decoded: Result<Vec<_>, StitchError> = fetched.into_par_iter().map(decode).collect();
-    let patch = Patch::new(candidate.size(), &decoded?);
+    let patch = Patch::of_sub_tiles(candidate.size(), &decoded?);
     let along = candidate.pixels_along_x(grid);
     for segment in &part.segments {
         let row = segment.y as usize * grid.size.x as usize;

@@ -6,6 +6,8 @@ use std::sync::Arc;
 
 use glam::{DVec2, UVec2};
 use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE};
+use saccade_core::levels::Level;
+use saccade_core::voxel_box::VoxelBox;
 
 use super::index::IndexedTile;
 use super::tiles::Pyramid;
@@ -20,6 +22,24 @@ pub(super) struct Grid {
 }
 
 impl Grid {
+    /// The voxels of a box, at their z.
+    pub(super) fn of_level(level: Level, voxels: VoxelBox) -> Self {
+        Self {
+            first: voxels.min.truncate(),
+            size: voxels.size().truncate(),
+            step: level.downsampling.truncate(),
+        }
+    }
+
+    /// With `by` x `by` samples for each.
+    pub(super) fn finer(&self, by: u32) -> Self {
+        Self {
+            first: self.first * by,
+            size: self.size * by,
+            step: self.step / f64::from(by),
+        }
+    }
+
     /// Where sample (x, y) sits \[level-0 voxels\].
     pub(super) fn point(&self, x: u32, y: u32) -> DVec2 {
         ((self.first.as_dvec2() + DVec2::new(f64::from(x), f64::from(y))) + 0.5) * self.step
@@ -71,6 +91,23 @@ impl Candidate {
     /// How far that position moves from one sample to the next.
     pub(super) fn pixels_along_x(&self, grid: &Grid) -> DVec2 {
         self.tile.tile_from_section.along_x() * grid.step.x / f64::from(1_u32 << self.level)
+    }
+
+    /// Bounds of the values that it may give to samples, and whether it covers all of them.
+    pub(super) fn range(&self, grid: &Grid) -> (Option<(u8, u8)>, bool) {
+        let UVec2 { x, y } = grid.size - 1;
+        let corners = [(0, 0), (x, 0), (0, y), (x, y)];
+        let inside = |(x, y)| self.tile.contains(self.tile.position(grid.point(x, y)));
+        let pixels = corners.map(|(x, y)| self.pixel(grid, x, y));
+        let min = pixels.into_iter().fold(DVec2::INFINITY, DVec2::min);
+        let max = pixels.into_iter().fold(DVec2::NEG_INFINITY, DVec2::max);
+        let size = self.size();
+        let size = UVec2::new(size.width, size.height).as_dvec2();
+        if min.cmpgt(size + 1.0).any() || max.cmplt(DVec2::splat(-1.0)).any() {
+            return (None, false);
+        }
+        let (range, blanks) = self.pyramid.range(self.level, min, max);
+        (range, !blanks && corners.into_iter().all(inside))
     }
 
     /// Cuts a row where the tile's pixels are in blank sub-tiles; calls `keep` with the rest.

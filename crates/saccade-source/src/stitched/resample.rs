@@ -1,18 +1,18 @@
 //! From decoded sub-tiles to samples.
 
+mod line;
+
 use bytes::Bytes;
 use glam::{DVec2, UVec2};
 use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE};
 
-/// Bits after the point of interpolation weights: 8 + 11 + 11 fit 32 bits with room to round.
-const WEIGHT_BITS: u32 = 11;
-const ONE: u32 = 1 << WEIGHT_BITS;
-/// Bits after the point of positions.
-const POSITION_BITS: u32 = 32;
+use line::{Line, MARGIN, interpolate};
 
-/// A rectangle of a pyramid level in one piece, with a border of one pixel, in which the level's
-/// edge pixels are repeated.
-pub(super) struct Patch {
+/// An image, or a rectangle of a pyramid's level, in one piece, to be sampled along lines.
+///
+/// It has a border of one pixel, in which the image's edge pixels are repeated.
+#[derive(Clone, Debug)]
+pub struct Patch {
     values: Vec<u8>,
     width: usize,
     /// Pixel of the level that the patch's first one is.
@@ -20,8 +20,29 @@ pub(super) struct Patch {
 }
 
 impl Patch {
+    /// Of an image of `size` pixels, x fastest.
+    ///
+    /// # Panics
+    ///
+    /// If there are not as many pixels, or none.
+    pub fn of_image(pixels: &[u8], size: UVec2) -> Self {
+        let [width, height] = size.as_usizevec2().to_array();
+        assert!(
+            width * height == pixels.len() && !pixels.is_empty(),
+            "{} pixels are no image of {size}",
+            pixels.len()
+        );
+        let stride = width + 2;
+        let mut values = vec![0; stride * (height + 2)];
+        let rows = values.chunks_exact_mut(stride).skip(1);
+        for (to, row) in rows.zip(pixels.chunks_exact(width)) {
+            to[1..=width].copy_from_slice(row);
+        }
+        Self::with_border(values, UVec2::ZERO, size, size)
+    }
+
     /// From all sub-tiles that will be sampled; blank ones may be left out.
-    pub(super) fn new(level: PyramidLevel, sub_tiles: &[(UVec2, Bytes)]) -> Self {
+    pub(super) fn of_sub_tiles(level: PyramidLevel, sub_tiles: &[(UVec2, Bytes)]) -> Self {
         let places = || sub_tiles.iter().map(|(at, _)| *at);
         let first = places().reduce(UVec2::min).unwrap_or(UVec2::ZERO);
         let last = places().reduce(UVec2::max).unwrap_or(UVec2::ZERO);
@@ -45,6 +66,12 @@ impl Patch {
                 values[at..at + valid.x].copy_from_slice(&row[..valid.x]);
             }
         }
+        Self::with_border(values, start, end, size)
+    }
+
+    /// Fills the border around pixels `start` to `end` of an image of `size` where it ends there.
+    fn with_border(mut values: Vec<u8>, start: UVec2, end: UVec2, size: UVec2) -> Self {
+        let width = (end.x - start.x) as usize + 2;
         for row in values.chunks_exact_mut(width) {
             if start.x == 0 {
                 row[0] = row[1];
@@ -60,6 +87,7 @@ impl Patch {
             let after = values.len() - width;
             values.copy_within(after - width..after, after);
         }
+        values.resize(values.len() + MARGIN, 0);
         Self {
             values,
             width,
@@ -67,55 +95,19 @@ impl Patch {
         }
     }
 
-    /// Interpolates along a line from `pixel` in steps of `along` \[pixels of the level\]. All
-    /// samples must lie in the level and in sub-tiles the patch was made of, or in blank ones.
-    #[expect(
-        clippy::cast_possible_truncation,
-        reason = "fixed point: positions in a patch are small and not negative, weights below 2^11"
-    )]
-    pub(super) fn sample(&self, pixel: DVec2, along: DVec2, out: &mut [u8]) {
-        let at = pixel - 0.5 - self.origin;
-        let fixed = |v: f64| (v * (1_u64 << POSITION_BITS) as f64).round() as i64;
-        let weight = |v: i64| (v >> (POSITION_BITS - WEIGHT_BITS)) as u32 & (ONE - 1);
-        let mix = |a: [u8; 2], b: [u8; 2], x: u32, y: u32| {
-            let [a0, a1, b0, b1] = [a[0], a[1], b[0], b[1]].map(u32::from);
-            let top = a0 * (ONE - x) + a1 * x;
-            let bottom = b0 * (ONE - x) + b1 * x;
-            let sum = top * (ONE - y) + bottom * y + (1 << (2 * WEIGHT_BITS - 1));
-            ((sum >> (2 * WEIGHT_BITS)) as u8).max(1)
-        };
-        let (mut x, mut y) = (fixed(at.x), fixed(at.y));
-        let index = |x: i64, y: i64| {
-            (y >> POSITION_BITS) as usize * self.width + (x >> POSITION_BITS) as usize
-        };
+    /// Interpolates linearly along a line from `pixel` in steps of `along` \[pixels; pixel `i` covers
+    /// `[i, i + 1)`\], less than one grey level off, and at least 1. All samples must lie in the image,
+    /// and in sub-tiles the patch was made of, or in blank ones.
+    pub fn sample(&self, pixel: DVec2, along: DVec2, out: &mut [u8]) {
+        let line = Line::new(pixel - 0.5 - self.origin, along);
         let length = out.len() as f64;
-        if (along.x - 1.0).abs() * length < 1e-4 && along.y.abs() * length < 1e-4 {
-            // Pixel for pixel: the same weights all along. Rounding must not straddle a pixel.
-            let half = 1_i64 << (POSITION_BITS - WEIGHT_BITS - 1);
-            (x, y) = (x + half, y + half);
-            let (wx, wy, first) = (weight(x), weight(y), index(x, y));
-            let (n, width) = (out.len(), self.width);
-            if wx == 0 && wy == 0 {
-                for (out, value) in out.iter_mut().zip(&self.values[first..first + n]) {
-                    *out = (*value).max(1);
-                }
-                return;
-            }
-            let top = &self.values[first..first + n + 1];
-            let bottom = &self.values[first + width..first + width + n + 1];
-            for (out, (a, b)) in out.iter_mut().zip(top.windows(2).zip(bottom.windows(2))) {
-                *out = mix([a[0], a[1]], [b[0], b[1]], wx, wy);
-            }
-            return;
-        }
-        let (dx, dy) = (fixed(along.x), fixed(along.y));
-        for out in out {
-            let first = index(x, y);
-            let a = &self.values[first..first + 2];
-            let b = &self.values[first + self.width..first + self.width + 2];
-            *out = mix([a[0], a[1]], [b[0], b[1]], weight(x), weight(y));
-            (x, y) = (x + dx, y + dy);
-        }
+        let straight = (along.x - 1.0).abs() * length < 1e-4 && along.y.abs() * length < 1e-4;
+        let line = if straight {
+            line.pixel_for_pixel()
+        } else {
+            line
+        };
+        interpolate(&self.values, self.width, line, out);
     }
 }
 
@@ -144,6 +136,7 @@ pub(super) fn averaged(values: &[u8], size: UVec2, by: u32) -> Vec<u8> {
 #[allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
 
     /// 200 x 140 pixels, of which the last sub-tiles are mostly padding (77, to be ignored).
     fn patch() -> (Patch, impl Fn(i64, i64) -> f64) {
@@ -164,7 +157,7 @@ mod tests {
             })
             .into();
         let clamped = move |x: i64, y: i64| f64::from(value(x.clamp(0, 199), y.clamp(0, 139)));
-        (Patch::new(level, &sub_tiles), clamped)
+        (Patch::of_sub_tiles(level, &sub_tiles), clamped)
     }
 
     fn exact(value: &impl Fn(i64, i64) -> f64, at: DVec2) -> f64 {
@@ -200,6 +193,43 @@ mod tests {
                 shift = shift.max((exact(&value, at + DVec2::X) - want).abs());
             }
             assert!(shift > 10.0, "a pixel further would be seen: {shift}");
+        }
+    }
+
+    proptest! {
+        /// Every way of sampling: runs, gathered, shifted, and all lengths of what is left over.
+        #[test]
+        fn is_less_than_a_level_off(
+            degrees in prop_oneof![Just(0.0), -0.2..0.2, -3.0..3.0, -180.0..180.0],
+            scale in prop_oneof![Just(1.0), 0.995..1.005, 0.5..2.0],
+            start in (0.0..1.0, 0.0..1.0),
+            length in 1..160_usize,
+            seed in any::<u64>(),
+        ) {
+            let size = UVec2::new(190, 170);
+            let pixels = crate::stitched::tests::noise(190, 170, seed);
+            let patch = Patch::of_image(&pixels, size);
+            let value = |x: i64, y: i64| {
+                f64::from(pixels[(y.clamp(0, 169) * 190 + x.clamp(0, 189)) as usize])
+            };
+            let along = DVec2::from_angle(f64::to_radians(degrees)) * scale;
+            let size = size.as_dvec2();
+            // As many samples as there is room for from here.
+            let start = DVec2::from(start) * (size - 0.01);
+            let inside = |n: &usize| {
+                let at = start + along * *n as f64;
+                at.cmpge(DVec2::ZERO).all() && at.cmplt(size).all()
+            };
+            let length = (0..length).take_while(inside).count();
+            let mut out = vec![0; length];
+            patch.sample(start, along, &mut out);
+            for (n, got) in out.iter().enumerate() {
+                let want = exact(&value, start + along * n as f64).max(1.0);
+                let off = (f64::from(*got) - want).abs();
+                // Half a level of it is the last rounding.
+                prop_assert!(off < 1.5, "sample {} is {}, not {}", n, got, want);
+                prop_assert!(got.abs_diff(want.round() as u8) <= 1);
+            }
         }
     }
 

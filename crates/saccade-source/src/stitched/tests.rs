@@ -8,12 +8,13 @@ mod oracle;
 use std::future::Future;
 use std::time::Duration;
 
-use glam::{DVec3, UVec3};
+use glam::{DVec3, UVec2, UVec3};
 use proptest::prelude::*;
 
 use super::StitchedOptions;
 use crate::conformance::check_reading;
 use crate::{Chunk, ChunkId, SourceError, VolumeSource};
+pub(super) use fixture::noise;
 use fixture::{Fixture, chunk_of, difference, expected, read_all, tile};
 
 /// Runs a test with a limit, so that a lost answer fails instead of hanging.
@@ -275,6 +276,112 @@ fn values_are_within_their_bounds_and_known_after_reading() {
         source.read(id).await.unwrap();
         let range = source.value_range(id).unwrap();
         assert_eq!((range.min, range.max), (1, 255), "of noise");
+    });
+}
+
+#[test]
+fn bounds_are_found_without_decoding() {
+    run(async {
+        let extent = UVec3::new(700, 300, 9);
+        let mut fixture = Fixture::new(extent, DVec3::new(4.0, 4.0, 30.0)).await;
+        for section in [0, 1, 2, 5] {
+            let mut dim = tile((300, 260), section, (10.0, 20.0), 3.0, 1.0, 1);
+            dim.pixels.iter_mut().for_each(|p| *p = 10 + *p % 50);
+            fixture.put(&format!("dim{section}"), dim).await;
+            let mut bright = tile((300, 260), section, (330.0, 8.0), -2.0, 1.0, 2);
+            bright.pixels.iter_mut().for_each(|p| *p = 200 + *p % 40);
+            fixture.put(&format!("bright{section}"), bright).await;
+        }
+        let source = fixture.open().await;
+        let (volume, want) = (fixture.volume.clone(), fixture.expected());
+        let (mut tight, mut nothing) = (0, 0);
+        for level in 0..volume.levels.len() as u32 {
+            let chunks = saccade_core::voxel_box::VoxelBox::of_size(volume.chunks(level as usize));
+            for chunk in chunks.iter() {
+                let id = ChunkId {
+                    channel: 0,
+                    level,
+                    chunk,
+                };
+                let found = source.find_value_range(id).await.unwrap();
+                let values = chunk_of(&volume, &want, id);
+                let values = values.iter().filter(|v| **v != 0).map(|v| u16::from(*v));
+                match (values.clone().min(), values.max()) {
+                    (Some(min), Some(max)) => {
+                        let found = found.unwrap();
+                        assert!(found.min <= min && max <= found.max, "{id}: {found:?}");
+                        tight += u32::from(found.max < 60 || found.min >= 200);
+                    }
+                    _ => nothing += u32::from(found.is_none()),
+                }
+            }
+        }
+        assert!(tight > 20, "{tight} chunks are of one tile");
+        assert!(nothing > 0, "a chunk is known to be empty");
+        let statistics = source.statistics();
+        assert_eq!(
+            (statistics.sub_tiles_decoded, statistics.blocks_built),
+            (0, 0)
+        );
+    });
+}
+
+#[test]
+fn cross_sections_are_cut_out_of_the_volume() {
+    run(async {
+        let fixture = aligned().await;
+        let source = fixture.open().await;
+        let whole = read_all(&source).await;
+        for (level, z, min, size) in [
+            (0, 1, (200, 30), (333, 77)),
+            (0, 33, (0, 0), (700, 150)),
+            (1, 2, (111, 5), (512, 512)),
+            (3, 0, (0, 0), (40, 9)),
+            (0, 3, (0, 0), (64, 64)),
+            (0, 1, (700, 0), (64, 64)),
+            (0, 40, (0, 0), (64, 64)),
+        ] {
+            let extent = fixture.volume.levels[level as usize].extent;
+            let (min, size) = (UVec2::from(min), UVec2::from(size));
+            let got = source.cross_section(level, z, min, size).await.unwrap();
+            let end = (min + size).min(extent.truncate());
+            let rows = (min.y..end.y).flat_map(|y| (min.x..end.x).map(move |x| (x, y)));
+            let inside = rows.filter(|_| z < extent.z).map(|(x, y)| {
+                let at = (z as usize * extent.y as usize + y as usize) * extent.x as usize;
+                whole[level as usize][at + x as usize]
+            });
+            let want: Vec<u8> = inside.collect();
+            match got {
+                Some(got) => {
+                    assert_eq!(got.size, end - min);
+                    assert_eq!(got.values, want, "level {level}, z {z}");
+                    assert!(want.iter().any(|v| *v != 0));
+                }
+                None => assert!(want.iter().all(|v| *v == 0), "level {level}, z {z}"),
+            }
+        }
+    });
+}
+
+#[test]
+fn what_has_one_value_is_not_decoded() {
+    run(async {
+        let mut fixture = Fixture::new(UVec3::new(600, 300, 3), DVec3::new(4.0, 4.0, 30.0)).await;
+        let mut resin = tile((512, 256), 1, (20.5, 10.25), 0.0, 1.0, 3);
+        for (at, pixel) in resin.pixels.iter_mut().enumerate() {
+            if at % 512 >= 128 || at / 512 >= 128 {
+                *pixel = 177;
+            }
+        }
+        fixture.put("resin", resin).await;
+        let source = fixture.open().await;
+        let block = source
+            .cross_section(0, 1, UVec2::ZERO, UVec2::splat(600))
+            .await;
+        let (got, want) = (block.unwrap().unwrap().values, fixture.expected());
+        let want = &want[0][600 * 300..2 * 600 * 300];
+        assert!(got.iter().zip(want).all(|(a, b)| a.abs_diff(*b) <= 1));
+        assert_eq!(source.statistics().sub_tiles_decoded, 1, "of eight");
     });
 }
 

@@ -47,6 +47,30 @@ impl Pyramid {
         self.blanks[level as usize]
     }
 
+    /// Smallest and largest value of the sub-tiles that a rectangle \[pixels of the level\] touches,
+    /// blank ones left out, and whether there are such; `None` if all are blank.
+    pub(super) fn range(&self, level: u32, min: DVec2, max: DVec2) -> (Option<(u8, u8)>, bool) {
+        let size = self.index.levels()[level as usize];
+        let last = UVec2::new(size.width - 1, size.height - 1).as_dvec2();
+        // Between the centres of two pixels in each direction.
+        let low = (min - 0.51).clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
+        let high = (max + 0.51).clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
+        let mut range: Option<(u8, u8)> = None;
+        let mut blanks = false;
+        for y in low.y..=high.y {
+            for x in low.x..=high.x {
+                match self.index.sub_tile(level as usize, x, y) {
+                    Some(entry) if !entry.is_blank() => {
+                        let (least, most) = range.unwrap_or((entry.min, entry.max));
+                        range = Some((least.min(entry.min), most.max(entry.max)));
+                    }
+                    _ => blanks = true,
+                }
+            }
+        }
+        (range, blanks)
+    }
+
     /// Whether a position \[pixels of the level\] is in a blank sub-tile.
     pub(super) fn is_blank_at(&self, level: u32, pixel: DVec2) -> bool {
         let size = self.index.levels()[level as usize];
@@ -65,8 +89,9 @@ pub(super) struct SubTileKey {
     at: UVec2,
 }
 
-/// A sub-tile as it was read or, better, as it was decoded before.
+/// A sub-tile as it was read or, better, as it was decoded before or need not be.
 pub(super) enum Fetched {
+    Constant(u8),
     Encoded(Bytes),
     Decoded(Bytes),
 }
@@ -153,7 +178,8 @@ impl Tiles {
         self.pyramids.get_or_insert_async(&tile.pyramid, open).await
     }
 
-    /// Fetches sub-tiles of a level, neighbours together; blank ones are left out.
+    /// Fetches sub-tiles of a level, neighbours together. Blank ones are left out; those of one value
+    /// are known without a read.
     pub(super) async fn fetch(
         &self,
         pyramid: &Pyramid,
@@ -164,6 +190,11 @@ impl Tiles {
         let mut fetched = Vec::with_capacity(wanted.len());
         let mut missing = Vec::new();
         for at in wanted {
+            let entry = pyramid.index.sub_tile(level as usize, at.x, at.y);
+            if let Some(entry) = entry.filter(|e| e.min == e.max && !e.is_blank()) {
+                fetched.push((at, Fetched::Constant(entry.min)));
+                continue;
+            }
             match self.sub_tiles.get(&key(pyramid, level, at)) {
                 Some(voxels) => fetched.push((at, Fetched::Decoded(voxels))),
                 None => missing.push(at),
@@ -200,6 +231,7 @@ impl Tiles {
         fetched: Fetched,
     ) -> Result<Bytes, StitchError> {
         let bytes = match fetched {
+            Fetched::Constant(value) => return Ok(vec![value; SUB_TILE_VOXELS].into()),
             Fetched::Decoded(voxels) => return Ok(voxels),
             Fetched::Encoded(bytes) => bytes,
         };

@@ -179,7 +179,7 @@ pub(super) fn difference(got: &Levels, want: &Levels) -> (usize, u8) {
 }
 
 /// Pixels that no shift leaves alike; from a seed.
-pub(super) fn noise(width: usize, height: usize, seed: u64) -> Vec<u8> {
+pub(in crate::stitched) fn noise(width: usize, height: usize, seed: u64) -> Vec<u8> {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let pixels = (0..width * height).map(|_| {
         state ^= state << 13;
