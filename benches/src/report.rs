@@ -44,6 +44,11 @@ impl Row {
         }
     }
 
+    /// Median of its runs.
+    pub(crate) fn value(&self) -> f64 {
+        self.value
+    }
+
     pub(crate) fn peer(mut self, value: f64, what: &'static str) -> Self {
         self.peer = Some(Peer { value, what });
         self

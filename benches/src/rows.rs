@@ -2,8 +2,11 @@
 
 mod construct;
 mod first_light;
+mod index;
 mod ingest;
 mod render;
+mod resample;
+mod section;
 mod serve;
 
 use anyhow::Result;
@@ -28,6 +31,18 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: construct::IDS,
         measure: construct::measure,
+    },
+    Group {
+        ids: section::IDS,
+        measure: section::measure,
+    },
+    Group {
+        ids: resample::IDS,
+        measure: resample::measure,
+    },
+    Group {
+        ids: index::IDS,
+        measure: index::measure,
     },
     Group {
         ids: render::IDS,

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use glam::{DVec2, DVec3, UVec2, UVec3};
+use rustix::fs::Advice;
 use saccade_archive::acquisition::{AcquisitionInfo, Record, RecordWriter, TileRecord};
 use saccade_core::phantom::Phantom;
 use saccade_core::transform::SectionFromTile;
@@ -160,6 +161,33 @@ impl Mosaic {
         }
         Ok(())
     }
+}
+
+/// A small generator of random numbers: a xorshift.
+#[derive(Clone, Debug)]
+pub(crate) struct Random(pub(crate) u64);
+
+impl Random {
+    /// Below `end`.
+    pub(crate) fn below(&mut self, end: u32) -> u32 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        u32::try_from((self.0 >> 32) % u64::from(end.max(1))).unwrap_or(0)
+    }
+}
+
+/// Drops the files of a folder from the system's cache.
+pub(crate) fn drop_from_cache(folder: &Path) -> Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let path = entry?.path();
+        if path.is_dir() {
+            drop_from_cache(&path)?;
+        } else {
+            rustix::fs::fadvise(&File::open(&path)?, 0, None, Advice::DontNeed)?;
+        }
+    }
+    Ok(())
 }
 
 #[cfg(test)]
