@@ -2,7 +2,10 @@
 
 import json
 import os
+import subprocess
+import sys
 import unittest
+from pathlib import Path
 
 import numpy as np
 import ome_zarr_models
@@ -61,6 +64,14 @@ class Live(unittest.TestCase):
         self.assertGreater(measured, compared / 4, "most of what was compared was not acquired yet")
         self.assertGreater(turned_differs, compared / 4, "the comparison cannot tell axes apart")
         print(f"\n{compared} positions on {self.levels} levels, {measured} of them acquired, {len(clients)} clients")
+
+    def test_2_the_example_runs(self):
+        example = Path(__file__).parents[2] / "examples" / "live_volume.py"
+        run = subprocess.run([sys.executable, example, self.acquisition.url], capture_output=True, text=True, timeout=60)
+        self.assertEqual(run.returncode, 0, run.stderr)
+        self.assertRegex(run.stdout, r"tissue: 301 x 203 x 70 voxels of 8.0 x 8.0 x 40.0 nm, \d+ tiles")
+        self.assertRegex(run.stdout, r"acquired: \d+%")
+        self.assertRegex(run.stdout, r"revision \d+: tile at")
 
     def test_2_metadata_is_what_the_specifications_say(self):
         yaozarrs.validate_zarr_store(f"{self.url}/zarr")

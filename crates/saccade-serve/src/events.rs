@@ -12,6 +12,7 @@ use futures::{Stream, StreamExt, stream};
 use saccade_source::Change;
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
+use crate::api::ChangeDocument;
 use crate::volumes::Published;
 
 /// So that proxies keep a quiet stream, and clients notice a dead one.
@@ -38,7 +39,11 @@ pub(crate) fn events(
             .event("change")
             .id(change.revision.to_string());
         // A change is numbers and an enum: it always has a JSON form.
-        Ok::<_, Infallible>(event.json_data(change).unwrap_or_default())
+        Ok::<_, Infallible>(
+            event
+                .json_data(ChangeDocument::from(change))
+                .unwrap_or_default(),
+        )
     });
     let closed = async move {
         // An error means that the server is gone: closed just the same.

@@ -9,6 +9,7 @@
 //! |---|---|
 //! | `/` | the browser application |
 //! | `/volumes` | a page that lists the volumes, with links that open them in other viewers |
+//! | `/openapi.json` | describes the answers in JSON |
 //! | `/volumes.json` | names and revisions |
 //! | `/v/NAME/volume.json` | the description, the revision and the version |
 //! | `/v/NAME/status.json` | tiles, sections, files set aside |
@@ -51,6 +52,7 @@
 //! users and no encryption: it listens on this computer only, unless told otherwise. It reads no
 //! bodies of requests.
 
+mod api;
 mod archive;
 mod assets;
 mod events;

@@ -15,16 +15,17 @@ use axum::middleware::{Next, from_fn_with_state, map_response};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use serde_json::{Value, json};
 use tokio::sync::{Semaphore, watch};
 use tower_http::CompressionLevel;
 use tower_http::compression::CompressionLayer;
 use tower_http::cors::{AllowOrigin, Any, CorsLayer};
+use utoipa::OpenApi;
 
+use crate::api::{Document, VolumeDescription, VolumeEntry, VolumeList};
 use crate::assets::asset;
 use crate::events;
 use crate::formats::{Entry, Format, Unknown};
-use crate::http::{internal, mark_encoding, not_found, try_again};
+use crate::http::{Refusal, internal, mark_encoding, not_found, try_again};
 use crate::index::index;
 use crate::pieces::piece;
 use crate::server::{Compress, Compressible, Gate, Options, Origins};
@@ -110,6 +111,7 @@ pub(crate) fn router(app: App) -> Router {
     }
     router
         .route("/volumes", get(list))
+        .route("/openapi.json", get(api))
         .route("/volumes.json", get(volumes))
         .route("/v/{name}/volume.json", get(volume))
         .route("/v/{name}/status.json", get(status))
@@ -166,26 +168,53 @@ fn described(value: impl serde::Serialize) -> Response {
     response
 }
 
-async fn volumes(State(app): State<App>) -> Response {
-    let entry = |published: &Arc<Published>| {
-        let revision = published.history().revision();
-        json!({ "name": published.volume().name, "revision": revision })
+/// The volumes on offer.
+#[utoipa::path(get, path = "/volumes.json", responses((status = 200, body = VolumeList)))]
+pub(crate) async fn volumes(State(app): State<App>) -> Response {
+    let entry = |published: &Arc<Published>| VolumeEntry {
+        name: published.volume().name.clone(),
+        revision: published.history().revision(),
     };
-    let all: Vec<Value> = app.volumes.all().iter().map(entry).collect();
-    described(json!({ "volumes": all }))
+    let volumes = app.volumes.all().iter().map(entry).collect();
+    described(VolumeList { volumes })
 }
 
-async fn volume(State(app): State<App>, Path(name): Path<String>) -> Response {
+/// What a volume is, and which state of it is offered now.
+#[utoipa::path(
+    get,
+    path = "/v/{name}/volume.json",
+    params(("name" = String, Path, description = "name of the volume")),
+    responses(
+        (status = 200, body = VolumeDescription),
+        (status = 404, body = Refusal, description = "no such volume")
+    )
+)]
+pub(crate) async fn volume(State(app): State<App>, Path(name): Path<String>) -> Response {
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,
     };
-    let revision = published.history().revision();
-    let version = published.version();
-    described(json!({ "volume": **published.volume(), "revision": revision, "version": version }))
+    // Together: a change must not come between them.
+    let (revision, version) = published.state();
+    described(VolumeDescription {
+        volume: (&**published.volume()).into(),
+        revision,
+        version,
+    })
 }
 
-async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
+/// How the acquisition of a volume is coming along.
+#[utoipa::path(
+    get,
+    path = "/v/{name}/status.json",
+    params(("name" = String, Path, description = "name of the volume")),
+    responses(
+        (status = 200, body = Status),
+        (status = 404, body = Refusal, description = "no such volume"),
+        (status = 500, body = Refusal, description = "the catalog cannot be read")
+    )
+)]
+pub(crate) async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,
@@ -205,7 +234,26 @@ async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
     }
 }
 
-async fn changes(State(app): State<App>, Path(name): Path<String>, headers: HeaderMap) -> Response {
+/// Every change from now on, or after the revision in `Last-Event-ID`: events `change` whose data is a
+/// `Change` in JSON and whose id is its revision.
+#[utoipa::path(
+    get,
+    path = "/v/{name}/events",
+    params(
+        ("name" = String, Path, description = "name of the volume"),
+        ("Last-Event-ID" = Option<u64>, Header, description = "the revision seen last")
+    ),
+    responses(
+        (status = 200, body = String, content_type = "text/event-stream"),
+        (status = 404, body = Refusal, description = "no such volume"),
+        (status = 503, body = Refusal, description = "too many clients listen; ask again after Retry-After")
+    )
+)]
+pub(crate) async fn changes(
+    State(app): State<App>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,
@@ -216,11 +264,31 @@ async fn changes(State(app): State<App>, Path(name): Path<String>, headers: Head
     }
 }
 
+/// The description of all this.
+async fn api() -> Response {
+    described(Document::openapi())
+}
+
 async fn list(State(app): State<App>, headers: HeaderMap) -> Response {
     index(&app.volumes, &headers)
 }
 
-async fn picture(State(app): State<App>, Path(name): Path<String>, headers: HeaderMap) -> Response {
+/// A section near the middle, from afar.
+#[utoipa::path(
+    get,
+    path = "/v/{name}/thumbnail.png",
+    params(("name" = String, Path, description = "name of the volume")),
+    responses(
+        (status = 200, body = Vec<u8>, content_type = "image/png"),
+        (status = 404, body = Refusal, description = "no such volume, or nothing was acquired yet"),
+        (status = 503, body = Refusal, description = "not ready; ask again after Retry-After")
+    )
+)]
+pub(crate) async fn picture(
+    State(app): State<App>,
+    Path(name): Path<String>,
+    headers: HeaderMap,
+) -> Response {
     match find(&app, &name) {
         Ok(published) => thumbnail(&published, &headers, app.options.patience).await,
         Err(refusal) => *refusal,
@@ -259,7 +327,7 @@ async fn object(
 /// The application's files, and everything that does not exist.
 async fn other(State(app): State<App>, uri: Uri, headers: HeaderMap) -> Response {
     asset(uri.path(), &headers).unwrap_or_else(|| {
-        let mut known = ["/", "/volumes", "/volumes.json"]
+        let mut known = ["/", "/volumes", "/volumes.json", "/openapi.json"]
             .map(str::to_owned)
             .to_vec();
         for name in app.volumes.names() {

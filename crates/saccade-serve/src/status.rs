@@ -5,9 +5,10 @@ use std::sync::Arc;
 use futures::future::BoxFuture;
 use saccade_archive::catalog::{Catalog, CatalogError};
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// The state of a volume's acquisition.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Status {
     /// Revision of the volume.
     pub revision: u64,
@@ -24,7 +25,7 @@ pub struct Status {
 }
 
 /// A file set aside.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Quarantined {
     /// As the acquisition names it.
     pub file: String,

@@ -139,8 +139,13 @@ impl Published {
     /// Names the state of the whole volume: in addresses, for clients that keep what they have and
     /// never ask again.
     pub(crate) fn version(&self) -> String {
+        self.state().1
+    }
+
+    /// The revision, and the version of the same moment.
+    pub(crate) fn state(&self) -> (u64, String) {
         let revision = self.history().revision();
-        format!("{:016x}-{revision}", self.instance)
+        (revision, format!("{:016x}-{revision}", self.instance))
     }
 
     /// Whether a chunk is still what it was in that version. `false` for a version of another

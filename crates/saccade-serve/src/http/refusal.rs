@@ -7,9 +7,12 @@ use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, RETRY_AFTER};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
+use utoipa::ToSchema;
 
-#[derive(Serialize)]
-struct Refusal {
+/// An answer that says no.
+#[derive(Serialize, ToSchema)]
+pub(crate) struct Refusal {
+    /// Why, in words for people.
     error: String,
     /// What could have been asked for instead.
     #[serde(skip_serializing_if = "Vec::is_empty")]

@@ -1,0 +1,190 @@
+//! The JSON API: what its answers are, and the document that describes them.
+//!
+//! The document is made from the types that are sent and from the handlers that send them.
+
+use saccade_core::levels::Level;
+use saccade_core::volume::{Dtype, Volume};
+use saccade_core::voxel_box::VoxelBox;
+use saccade_source::{Change, ChangeReason};
+use serde::Serialize;
+use utoipa::{OpenApi, ToSchema};
+
+/// The volumes on offer.
+#[derive(Debug, Serialize, ToSchema)]
+pub(crate) struct VolumeList {
+    /// In order of their names.
+    pub(crate) volumes: Vec<VolumeEntry>,
+}
+
+/// One volume on offer.
+#[derive(Debug, Serialize, ToSchema)]
+pub(crate) struct VolumeEntry {
+    /// As it stands in addresses, where it is percent-encoded.
+    pub(crate) name: String,
+    /// Grows with every change.
+    pub(crate) revision: u64,
+}
+
+/// What a volume is, and which state of it is offered now.
+#[derive(Debug, Serialize, ToSchema)]
+pub(crate) struct VolumeDescription {
+    pub(crate) volume: VolumeDocument,
+    /// Grows with every change.
+    pub(crate) revision: u64,
+    /// Names the state in addresses, `/v/NAME/at/VERSION/…`, for clients that never ask again.
+    pub(crate) version: String,
+}
+
+/// What a volume is.
+#[derive(Debug, PartialEq, Serialize, ToSchema)]
+#[schema(as = Volume)]
+pub(crate) struct VolumeDocument {
+    name: String,
+    dtype: DtypeDocument,
+    /// Names of the channels.
+    channels: Vec<String>,
+    /// Voxel size of level 0, x, y, z, in nanometres.
+    voxel_nm: [f64; 3],
+    /// Finest first.
+    levels: Vec<LevelDocument>,
+    /// Chunk size of every level, x, y, z, in its voxels.
+    chunk: [u32; 3],
+}
+
+/// How a voxel's value is stored: unsigned, little-endian.
+#[derive(Debug, PartialEq, Serialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(as = Dtype)]
+enum DtypeDocument {
+    Uint8,
+    Uint16,
+}
+
+/// One resolution of a volume.
+#[derive(Debug, PartialEq, Serialize, ToSchema)]
+#[schema(as = Level)]
+struct LevelDocument {
+    /// Size, x, y, z, in its voxels.
+    extent: [u32; 3],
+    /// Level-0 voxels per voxel, x, y, z.
+    downsampling: [f64; 3],
+}
+
+impl From<&Volume> for VolumeDocument {
+    fn from(volume: &Volume) -> Self {
+        let level = |level: &Level| LevelDocument {
+            extent: level.extent.to_array(),
+            downsampling: level.downsampling.to_array(),
+        };
+        Self {
+            name: volume.name.clone(),
+            dtype: match volume.dtype {
+                Dtype::Uint16 => DtypeDocument::Uint16,
+                _ => DtypeDocument::Uint8,
+            },
+            channels: volume.channels.clone(),
+            voxel_nm: volume.voxel_nm.to_array(),
+            levels: volume.levels.iter().map(level).collect(),
+            chunk: volume.chunk.to_array(),
+        }
+    }
+}
+
+/// Voxels that are no longer what they were.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Change)]
+pub(crate) struct ChangeDocument {
+    /// The volume's revision after it.
+    revision: u64,
+    voxels: BoxDocument,
+    reason: ReasonDocument,
+}
+
+/// The level-0 voxels `min <= v < max`, x, y, z.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = VoxelBox)]
+struct BoxDocument {
+    min: [u32; 3],
+    max: [u32; 3],
+}
+
+/// Why voxels changed: a tile came, a tile moved, or events were missed and anything may have changed.
+#[derive(Debug, Serialize, ToSchema)]
+#[serde(rename_all = "kebab-case")]
+#[schema(as = ChangeReason)]
+enum ReasonDocument {
+    Tile,
+    Transform,
+    Missed,
+}
+
+impl From<Change> for ChangeDocument {
+    fn from(change: Change) -> Self {
+        let VoxelBox { min, max } = change.voxels;
+        Self {
+            revision: change.revision,
+            voxels: BoxDocument {
+                min: min.to_array(),
+                max: max.to_array(),
+            },
+            reason: match change.reason {
+                ChangeReason::Tile => ReasonDocument::Tile,
+                ChangeReason::Transform => ReasonDocument::Transform,
+                // Whatever else there will be: the whole box is to be read again.
+                _ => ReasonDocument::Missed,
+            },
+        }
+    }
+}
+
+/// The document at `/openapi.json`.
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "Saccade",
+        description = "Volumes that grow while they are looked at. Voxels are served as OME-Zarr 0.5 \
+            (`/v/NAME/zarr/`), OME-Zarr 0.4 (`/v/NAME/zarr2/`) and Neuroglancer precomputed \
+            (`/v/NAME/precomputed/`), which their own specifications describe."
+    ),
+    paths(
+        crate::routes::volumes,
+        crate::routes::volume,
+        crate::routes::status,
+        crate::routes::changes,
+        crate::routes::picture,
+    ),
+    components(schemas(ChangeDocument))
+)]
+pub(crate) struct Document;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DVec3, UVec3};
+    use serde_json::to_value;
+
+    /// Saccade's own client reads the types of the core.
+    #[test]
+    fn documents_are_the_core_s_types() {
+        let mut volume =
+            Volume::new("v", UVec3::new(100, 90, 8), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+        for dtype in [Dtype::Uint8, Dtype::Uint16] {
+            volume.dtype = dtype;
+            let document = to_value(VolumeDocument::from(&volume)).unwrap();
+            assert_eq!(document, to_value(&volume).unwrap());
+        }
+        for reason in [
+            ChangeReason::Tile,
+            ChangeReason::Transform,
+            ChangeReason::Missed,
+        ] {
+            let change = Change {
+                revision: 7,
+                voxels: VoxelBox::new(UVec3::ONE, UVec3::new(2, 3, 4)),
+                reason,
+            };
+            let document = to_value(ChangeDocument::from(change)).unwrap();
+            assert_eq!(document, to_value(change).unwrap());
+        }
+    }
+}
