@@ -12,6 +12,7 @@
 //!   tile there; of two equally near ones the first. Of the sections with tiles, in that order, the
 //!   first four are looked at, then the 8th, 16th, 32nd and so on: a voxel that spans thousands of
 //!   sections asks a dozen.
+//!   Where it spans none, see [`Gaps`].
 //! - A tile is there if the sample lies in the tile's rectangle (low edges included, high ones not)
 //!   and not in a blank sub-tile. Where several are, the one whose centre is nearest wins, then the
 //!   one that changed last, then the one with the larger id.
@@ -31,6 +32,7 @@
 //! A tile that cannot be read fails the chunks it would be seen in, with its file's name; all other
 //! chunks are delivered. The tile is tried again after some seconds.
 
+mod along_z;
 mod block;
 mod blocks;
 mod build;
@@ -61,6 +63,7 @@ use blocks::Blocks;
 use build::Builder;
 use tiles::Tiles;
 
+pub use along_z::Gaps;
 pub use error::StitchError;
 pub use index::{SectionIndex, TileIndex, TileUpdate};
 pub use resample::Patch;
@@ -76,6 +79,8 @@ pub struct StitchedOptions {
     pub index_bytes: u64,
     /// Blocks built at a time.
     pub builds: usize,
+    /// What is shown in place of sections that have no tile.
+    pub gaps: Gaps,
     /// How long chunks fail that show a tile which cannot be read, until it is tried again.
     pub try_again: Duration,
 }
@@ -86,6 +91,7 @@ impl Default for StitchedOptions {
             block_bytes: 512 << 20,
             sub_tile_bytes: 256 << 20,
             index_bytes: 64 << 20,
+            gaps: Gaps::Empty,
             try_again: Duration::from_secs(3),
             builds: std::thread::available_parallelism().map_or(2, usize::from),
         }
@@ -182,7 +188,7 @@ impl StitchedSource {
         let inner = Arc::new(Inner {
             grid: BlockGrid::new(&volume),
             blocks: Blocks::new(options.block_bytes),
-            builder: Builder::new(volume.clone(), tiles, options.try_again),
+            builder: Builder::new(volume.clone(), tiles, &options),
             builds: Arc::new(Semaphore::new(options.builds.max(1))),
             changes: Changes::new(VoxelBox::of_size(volume.extent()), entry.revision),
             runtime: Handle::current(),

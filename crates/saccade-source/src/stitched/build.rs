@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use futures::future::{join_all, try_join_all};
+use futures::future::{join_all, try_join, try_join_all};
 use futures::stream::{self, StreamExt, TryStreamExt};
 use glam::{DVec2, UVec2};
 use rayon::prelude::*;
@@ -14,26 +14,25 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::oneshot;
 
-use super::StitchedStatistics;
+use super::along_z::{Gaps, Sections, between};
 use super::block::{Block, BlockGrid, Failure, Slice};
 use super::coverage::{Candidate, Grid, Segment, Uncovered};
 use super::error::StitchError;
 use super::index::IndexedTile;
 use super::resample::{Patch, averaged};
 use super::tiles::{Fetched, Tiles};
+use super::{StitchedOptions, StitchedStatistics};
 use crate::ValueRange;
 
 /// Samples per axis that a voxel larger than any pixel is the mean of, at most: 2^4.
 const FINEST_SAMPLING: u32 = 4;
-/// Of the sections that a voxel spans, all of these nearest ones are looked at; of those behind, ever
-/// fewer.
-const NEAR_SECTIONS: usize = 4;
 /// Sections of a block on which work is under way.
 const SECTIONS_AT_ONCE: usize = 4;
 
 pub(super) struct Builder {
     volume: Arc<Volume>,
     tiles: Arc<Tiles>,
+    gaps: Gaps,
     try_again: Duration,
     blocks: AtomicU64,
     voxels: AtomicU64,
@@ -46,11 +45,12 @@ struct Part {
 }
 
 impl Builder {
-    pub(super) fn new(volume: Arc<Volume>, tiles: Tiles, try_again: Duration) -> Self {
+    pub(super) fn new(volume: Arc<Volume>, tiles: Tiles, options: &StitchedOptions) -> Self {
         Self {
             volume,
             tiles: Arc::new(tiles),
-            try_again,
+            gaps: options.gaps,
+            try_again: options.try_again,
             blocks: AtomicU64::new(0),
             voxels: AtomicU64::new(0),
         }
@@ -73,10 +73,29 @@ impl Builder {
         }
     }
 
-    /// Whether a box of a level's voxels touches a section that has a tile.
+    /// Whether a box of a level's voxels touches a section that has a tile, or one that shows such.
     pub(super) fn may_have_data(&self, voxels: VoxelBox, level: u32) -> bool {
         let level0 = self.volume.levels[level as usize].voxels_from_box(voxels);
-        self.tiles.index().any_acquired(level0.min.z..level0.max.z)
+        let reach = self.gaps.longest();
+        let first = level0.min.z.saturating_sub(reach);
+        let end = level0.max.z.saturating_add(reach);
+        self.tiles.index().any_acquired(first..end)
+    }
+
+    /// The level-0 voxels that may be others when those of a box of one section are; `all` of its
+    /// sections if it has its first tile, or lost its last.
+    pub(super) fn touched(&self, mut voxels: VoxelBox, all: bool) -> VoxelBox {
+        let reach = self.gaps.longest();
+        let extent = self.volume.extent();
+        if reach > 0 {
+            voxels.min.z = voxels.min.z.saturating_sub(reach);
+            voxels.max.z = voxels.max.z.saturating_add(reach).min(extent.z);
+            if all {
+                voxels.min = voxels.min.with_x(0).with_y(0);
+                voxels.max = voxels.max.with_x(extent.x).with_y(extent.y);
+            }
+        }
+        voxels
     }
 
     /// Builds the block of these voxels.
@@ -122,11 +141,27 @@ impl Builder {
         voxels: VoxelBox,
         z: u32,
     ) -> Result<Option<(u8, u8)>, StitchError> {
+        match Sections::of(self.tiles.index(), self.gaps, level, z) {
+            Sections::FirstOf(sections) => self.range_of(level, voxels, &sections).await,
+            Sections::Between(below, above, _) => {
+                let below = self.range_of(level, voxels, &[below]).await?;
+                let above = self.range_of(level, voxels, &[above]).await?;
+                Ok(below.into_iter().chain(above).reduce(union))
+            }
+        }
+    }
+
+    async fn range_of(
+        &self,
+        level: Level,
+        voxels: VoxelBox,
+        sections: &[u32],
+    ) -> Result<Option<(u8, u8)>, StitchError> {
         let whole = Grid::of_level(level, voxels);
         let (min, max) = whole.bounds();
         let mut planned: Option<Grid> = None;
         let mut range = None;
-        for section in self.sections_of(level, z) {
+        for &section in sections {
             let near = self.near(section, min, max).await?;
             if near.is_empty() {
                 continue;
@@ -180,13 +215,41 @@ impl Builder {
 
     /// Stitches one z of a block.
     async fn slice(&self, level: Level, voxels: VoxelBox, z: u32) -> Result<Slice, StitchError> {
+        let (below, above, part) = match Sections::of(self.tiles.index(), self.gaps, level, z) {
+            Sections::FirstOf(sections) => return self.first_of(level, voxels, sections).await,
+            Sections::Between(below, above, part) => (below, above, part),
+        };
+        let below = self.first_of(level, voxels, vec![below]);
+        let above = self.first_of(level, voxels, vec![above]);
+        let (mut below, above) = try_join(below, above).await?;
+        let mixed = on_rayon(move || {
+            below.values = match (below.values, above.values) {
+                (Some(mut below), Some(above)) => {
+                    between(&mut below, &above, part);
+                    Some(below)
+                }
+                (below, above) => below.or(above),
+            };
+            below.failures.extend(above.failures);
+            below
+        });
+        Ok(mixed.await)
+    }
+
+    /// Stitches a plane of voxels, each from the first of these sections that has a tile there.
+    async fn first_of(
+        &self,
+        level: Level,
+        voxels: VoxelBox,
+        sections: Vec<u32>,
+    ) -> Result<Slice, StitchError> {
         let size = voxels.size().truncate();
         let mut planned: Option<(Grid, Uncovered)> = None;
         let mut parts = Vec::new();
         let mut failures = Vec::new();
         let whole = Grid::of_level(level, voxels);
         let (min, max) = whole.bounds();
-        for section in self.sections_of(level, z) {
+        for section in sections {
             let mut near = self.near(section, min, max).await?;
             if near.is_empty() {
                 continue;
@@ -267,23 +330,6 @@ impl Builder {
             }
         });
         Ok(sampled.await)
-    }
-
-    /// The sections with a tile that voxel `z` of a level spans, the one nearest its centre first, as
-    /// far as they are looked at.
-    fn sections_of(&self, level: Level, z: u32) -> Vec<u32> {
-        let span = level.downsampling.z;
-        let z = f64::from(z);
-        // Those whose middle lies within the voxel.
-        let first = |z: f64| DVec2::splat((z * span - 0.5).ceil().max(0.0)).as_uvec2().x;
-        let mut sections = self.tiles.index().acquired(first(z)..first(z + 1.0));
-        let centre = (z + 0.5) * span;
-        let distance = |section: &u32| (f64::from(*section) + 0.5 - centre).abs();
-        // Stable: of two equally near ones, the first.
-        sections.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
-        let ranked = (1_usize..).zip(sections);
-        let looked_at = ranked.filter(|(rank, _)| *rank <= NEAR_SECTIONS || rank.is_power_of_two());
-        looked_at.map(|(_, section)| section).collect()
     }
 }
 

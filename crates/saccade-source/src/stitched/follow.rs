@@ -4,6 +4,7 @@ use std::sync::Weak;
 use std::time::Duration;
 
 use saccade_archive::catalog::{Catalog, CatalogChange, CatalogError, ChangeReason};
+use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::watch;
 
 use super::Inner;
@@ -50,9 +51,10 @@ async fn catch_up(
         };
         // First what is known, then what was built of it, then the news: whoever reads after the
         // news gets neither.
-        inner.builder.tiles().index().apply(&changes).await;
+        let turned = inner.builder.tiles().index().apply(&changes).await;
         for change in changes {
-            inner.tell(&change);
+            let all = turned.contains(&change.section);
+            inner.tell(&change, inner.builder.touched(change.voxels, all));
             *seen = change.revision;
         }
     }
@@ -60,11 +62,11 @@ async fn catch_up(
 }
 
 impl Inner {
-    fn tell(&self, change: &CatalogChange) {
-        self.forget(change.voxels);
+    fn tell(&self, change: &CatalogChange, voxels: VoxelBox) {
+        self.forget(voxels);
         self.changes.send(Change {
             revision: change.revision,
-            voxels: change.voxels,
+            voxels,
             reason: match change.reason {
                 ChangeReason::Tile => crate::ChangeReason::Tile,
                 ChangeReason::Transform => crate::ChangeReason::Transform,

@@ -51,6 +51,14 @@ impl TileIndex {
         lock(&self.acquired).range(sections).copied().collect()
     }
 
+    /// The nearest sections with tiles below and above a range.
+    pub(super) fn around(&self, sections: Range<u32>) -> (Option<u32>, Option<u32>) {
+        let acquired = lock(&self.acquired);
+        let below = acquired.range(..sections.start).next_back();
+        let above = acquired.range(sections.end.max(sections.start)..).next();
+        (below.copied(), above.copied())
+    }
+
     /// Whether a section in a range has a tile.
     pub fn any_acquired(&self, sections: Range<u32>) -> bool {
         !sections.is_empty() && lock(&self.acquired).range(sections).next().is_some()
@@ -71,12 +79,17 @@ impl TileIndex {
         cell.get_or_try_init(load).await.cloned()
     }
 
-    /// Follows the catalog: what is asked for after this shows these changes.
+    /// Follows the catalog: what is asked for after this shows these changes. Returns the sections that
+    /// had no tile before, and those that have none any more.
     ///
     /// Reads the tiles that changed. Where that fails, their sections are forgotten, to be loaded when
     /// they are asked for.
-    pub async fn apply(&self, changes: &[CatalogChange]) {
-        lock(&self.acquired).extend(changes.iter().map(|change| change.section));
+    pub async fn apply(&self, changes: &[CatalogChange]) -> BTreeSet<u32> {
+        let mut turned: BTreeSet<u32> = changes.iter().map(|change| change.section).collect();
+        {
+            let mut acquired = lock(&self.acquired);
+            turned.retain(|section| acquired.insert(*section));
+        }
         let mut changed: BTreeMap<u32, BTreeSet<TileId>> = BTreeMap::new();
         for change in changes {
             changed
@@ -94,7 +107,7 @@ impl TileIndex {
             Err(error) => {
                 log::warn!("changed tiles cannot be read, their sections are forgotten: {error}");
                 lock(&self.sections).retain(|z, _| !changed.contains_key(z));
-                return;
+                return turned;
             }
         };
         let tiles: BTreeMap<_, _> = tiles.iter().map(|tile| (tile.id, tile)).collect();
@@ -114,8 +127,10 @@ impl TileIndex {
             // Hardly ever: the microscope says that a tile is of another section than it said before.
             if loses && self.section(z).await.is_ok_and(|index| index.tiles() == 0) {
                 lock(&self.acquired).remove(&z);
+                turned.insert(z);
             }
         }
+        turned
     }
 
     /// Tiles of the sections that are loaded.

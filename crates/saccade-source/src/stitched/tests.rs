@@ -3,6 +3,7 @@
 mod changes;
 mod failures;
 mod fixture;
+mod gaps;
 mod oracle;
 
 use std::future::Future;
