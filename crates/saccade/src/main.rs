@@ -3,6 +3,7 @@
 //! Everything happens in the rooms below; see the README of this crate for its one rule.
 
 #![allow(
+    rustdoc::bare_urls,
     rustdoc::broken_intra_doc_links,
     reason = "doc comments here are the help text, in which brackets hold units"
 )]
