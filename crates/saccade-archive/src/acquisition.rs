@@ -7,13 +7,16 @@
 //! - image files, named by the records, relative to the folder.
 //!
 //! Other people's formats become the same words: [`tile_list`] reads plain `file x y z` lists,
-//! [`trakem2`] the affine transforms of a TrakEM2 project.
+//! [`tile_configuration`] those of Fiji's stitching plugins, [`tile_specs`] the tiles of a Render
+//! stack, [`trakem2`] the affine transforms of a TrakEM2 project.
 //!
 //! Reading never changes the archive. Unknown fields are ignored, so that a microscope may say
 //! more than is understood here.
 
 mod record;
+pub mod tile_configuration;
 pub mod tile_list;
+pub mod tile_specs;
 pub mod trakem2;
 
 use std::fs;
@@ -90,6 +93,24 @@ pub enum AcquisitionError {
     Line {
         /// Line, from 1.
         line: u64,
+        /// What is wrong with it.
+        reason: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// A JSON file holds no tile specifications.
+    #[error("these are no tile specifications (a JSON array of tiles): {}", path.display())]
+    Json {
+        /// Where it stops making sense.
+        source: serde_json::Error,
+        /// File.
+        path: PathBuf,
+    },
+    /// A tile of a file cannot be used.
+    #[error("tile {tile:?}: {reason}: {}", path.display())]
+    Tile {
+        /// The tile.
+        tile: String,
         /// What is wrong with it.
         reason: String,
         /// File.

@@ -35,6 +35,7 @@ use crate::{Cancel, Meter, Progress, State};
 
 mod acquisition;
 mod detect;
+mod lists;
 
 pub use acquisition::{Acquisition, RawTile};
 pub use detect::{Input, detect};

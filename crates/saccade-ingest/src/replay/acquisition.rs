@@ -1,18 +1,18 @@
 //! A microscope's tiles in one frame: where the stage said, and where registration says.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec2, UVec2, UVec3};
-use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
-use saccade_archive::acquisition::trakem2::{self, Patch};
+use saccade_archive::acquisition::tile_list::{Images, ListedTile};
 use saccade_archive::image::decode_file;
 use saccade_core::transform::{SectionFromTile, TilePoint};
 use tiff::decoder::Decoder;
 
 use super::ReplayError;
+use super::lists::{self, Solution};
 use crate::simulate::settings::Fingerprint;
 use crate::simulate::stack::volume_name;
 
@@ -49,8 +49,11 @@ pub struct Acquisition {
 }
 
 impl Acquisition {
-    /// Reads a tile list, the sizes of its images, which lie anywhere below `folder`, and a TrakEM2
-    /// solution.
+    /// Reads a list of tiles, the sizes of its images, which lie anywhere below `folder`, and a
+    /// solution: the TrakEM2 project that is named, else what comes with the list.
+    ///
+    /// A list is `file x y z` per line, a tile configuration of Fiji, whose registered twin is its
+    /// solution, or Render's tile specifications, which hold both.
     ///
     /// The two frames differ by a translation, for a stage's zero means nothing to a solver. The
     /// median offset is taken out of the solution, so that the update refines rather than jumps.
@@ -59,16 +62,11 @@ impl Acquisition {
     ///
     /// [`ReplayError`].
     pub fn open(folder: &Path, list: &Path, solution: Option<&Path>) -> Result<Self, ReplayError> {
-        let listed = tile_list::read(list)?;
+        let listed = lists::read(list)?;
         let images = Images::below(folder)?;
-        let patches = solution.map(trakem2::read).transpose()?;
-        Self::new(
-            folder,
-            &images,
-            list,
-            &listed,
-            solution.zip(patches.as_deref()),
-        )
+        let named = solution.map(Solution::read).transpose()?;
+        let solution = named.or(listed.solution);
+        Self::new(folder, &images, list, &listed.tiles, solution.as_ref())
     }
 
     pub(super) fn new(
@@ -76,16 +74,10 @@ impl Acquisition {
         images: &Images,
         list: &Path,
         listed: &[ListedTile],
-        solution: Option<(&Path, &[Patch])>,
+        solution: Option<&Solution>,
     ) -> Result<Self, ReplayError> {
         let names = unique_names(listed);
         let first_section = listed.iter().map(|tile| tile.section).min().unwrap_or(0);
-        let patches: BTreeMap<&str, &Patch> = solution
-            .iter()
-            .flat_map(|(_, patches)| *patches)
-            .map(|p| (p.name(), p))
-            .collect();
-
         let missing: Vec<_> = listed
             .iter()
             .filter(|t| images.find(&t.file).is_none())
@@ -111,7 +103,7 @@ impl Acquisition {
                 image,
                 section: tile.section - first_section,
                 stage: SectionFromTile::translation(tile.corner),
-                aligned: patches.get(tile.name()).map(|patch| patch.transform),
+                aligned: solution.and_then(|s| s.transforms.get(tile.name()).copied()),
             });
         }
         tiles.sort_by_key(|tile| tile.section);
@@ -120,7 +112,7 @@ impl Acquisition {
         Ok(Self {
             name: volume_name(folder),
             list: list.to_owned(),
-            solution: solution.map(|(path, _)| path.to_owned()),
+            solution: solution.map(|solution| solution.path.clone()),
             extent,
             tiles,
         })

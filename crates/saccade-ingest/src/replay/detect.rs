@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
-use saccade_archive::acquisition::trakem2::{self, Patch};
+use saccade_archive::acquisition::tile_list::{Images, ListedTile};
 use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
 
 use super::acquisition::median_offset;
+use super::lists::{self, List, Solution};
 use super::{Acquisition, ReplayError};
 use crate::simulate::stack::{self, Stack, volume_name};
 
@@ -67,9 +67,11 @@ impl Input {
 
 /// Looks for an acquisition in a folder and below, else for a stack.
 ///
-/// - An acquisition has a tile list, `file x y z` per line, whose images lie anywhere below the folder.
-///   Of several such lists the least deep counts, then the first by name. Its solution is the TrakEM2 project that has a
-///   transform for every tile and moves some of them; one with more than translations counts first.
+/// - An acquisition has a list of tiles whose images lie anywhere below the folder: `file x y z` per
+///   line, a tile configuration of Fiji, or Render's tile specifications. Of several such lists the
+///   least deep counts, then the first by name, text before JSON. Its solution has a transform for
+///   every tile and moves some of them: what comes with the list, or a TrakEM2 project; one with
+///   more than translations counts first.
 /// - A stack is the path itself if it can be read as one; else the folder below with section images
 ///   whose name speaks of raw images rather than of labels, then the one with most sections, then
 ///   the first by name.
@@ -147,20 +149,25 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
     let images = Images::below(folder)?;
     let small = |path: &&Path| fs::metadata(path).is_ok_and(|meta| meta.len() <= LARGEST_LIST);
     let mut incomplete = None;
-    for list in tree.with_extension("txt").filter(small) {
-        // Most text files are no lists; that is no error.
-        let Ok(listed) = tile_list::read(list) else {
+    let text = tree.with_extension("txt");
+    for list in text.chain(tree.with_extension("json")).filter(small) {
+        if lists::is_registered(list) {
+            continue;
+        }
+        // Most files are no lists; that is no error.
+        let Ok(listed) = lists::read(list) else {
             continue;
         };
-        let found = listed
+        let tiles = &listed.tiles;
+        let here = tiles
             .iter()
-            .filter(|tile| images.find(&tile.file).is_some())
-            .count();
-        if found > 0 && found == listed.len() {
-            return Ok(Some(with_solution(folder, tree, &images, list, &listed)?));
+            .filter(|tile| images.find(&tile.file).is_some());
+        let found = here.count();
+        if found > 0 && found == tiles.len() {
+            return Ok(Some(with_solution(folder, tree, &images, list, listed)?));
         }
         if found > 0 && incomplete.is_none() {
-            incomplete = Some((list.to_owned(), listed));
+            incomplete = Some((list.to_owned(), listed.tiles));
         }
     }
     match incomplete {
@@ -175,55 +182,42 @@ fn with_solution(
     tree: &Tree,
     images: &Images,
     list: &Path,
-    listed: &[ListedTile],
+    listed: List,
 ) -> Result<Acquisition, ReplayError> {
-    let wanted: BTreeSet<&str> = listed.iter().map(ListedTile::name).collect();
-    let unsolved = Acquisition::new(folder, images, list, listed, None)?;
-    if wanted.len() < listed.len() {
+    let wanted: BTreeSet<&str> = listed.tiles.iter().map(ListedTile::name).collect();
+    let unsolved = Acquisition::new(folder, images, list, &listed.tiles, None)?;
+    if wanted.len() < listed.tiles.len() {
         // Names that mean several tiles cannot be looked up in a solution.
         return Ok(unsolved);
     }
-    let mut best: Option<(&Path, Vec<Patch>)> = None;
-    for path in tree.with_extension("xml") {
-        let Ok(patches) = trakem2::read(path) else {
-            continue;
-        };
-        let has: BTreeSet<&str> = patches.iter().map(Patch::name).collect();
-        if !wanted.is_subset(&has) || !refines(&unsolved, &patches) {
+    let mut best: Option<Solution> = None;
+    let projects = tree.with_extension("xml").map(Solution::read);
+    for solution in listed.solution.into_iter().chain(projects.flatten()) {
+        let has = |name: &&str| solution.transforms.contains_key(*name);
+        if !wanted.iter().all(has) || !refines(&unsolved, &solution) {
             continue;
         }
-        let better = match &best {
-            None => true,
-            Some((_, known)) => is_affine(&patches) && !is_affine(known),
-        };
-        if better {
-            best = Some((path, patches));
+        if best
+            .as_ref()
+            .is_none_or(|best| solution.is_affine() && !best.is_affine())
+        {
+            best = Some(solution);
         }
     }
     match &best {
         None => Ok(unsolved),
-        Some((path, patches)) => {
-            Acquisition::new(folder, images, list, listed, Some((path, patches)))
-        }
+        Some(best) => Acquisition::new(folder, images, list, &listed.tiles, Some(best)),
     }
 }
 
-/// Whether any transform does more than move.
-fn is_affine(patches: &[Patch]) -> bool {
-    patches
-        .iter()
-        .any(|patch| patch.transform.elements()[..4] != [1.0, 0.0, 0.0, 1.0])
-}
-
 /// Whether a solution says anything that the stage did not.
-fn refines(acquisition: &Acquisition, patches: &[Patch]) -> bool {
-    if is_affine(patches) {
+fn refines(acquisition: &Acquisition, solution: &Solution) -> bool {
+    if solution.is_affine() {
         return true;
     }
     let mut tiles = acquisition.tiles.clone();
     for tile in &mut tiles {
-        let patch = patches.iter().find(|patch| patch.name() == tile.name);
-        tile.aligned = patch.map(|patch| patch.transform);
+        tile.aligned = solution.transforms.get(&tile.name).copied();
     }
     let Some(offset) = median_offset(&tiles) else {
         return false;

@@ -135,6 +135,90 @@ fn lists_and_solutions_are_found_and_share_a_frame() {
     );
 }
 
+/// Two tiles of 30 x 20 in a folder of pictures.
+fn two_pictures() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for (n, name) in (0..).zip(["a", "b"]) {
+        let path = folder.path().join(format!("pictures/{name}.tif"));
+        image(&path, UVec2::new(30, 20), n);
+    }
+    folder
+}
+
+/// From the corner of tile 0 to that of tile 1: on the stage, and in the solution.
+fn steps(acquisition: &Acquisition) -> (DVec2, Option<DVec2>) {
+    let corner = |transform: SectionFromTile| transform.apply(TilePoint(DVec2::ZERO)).0;
+    let [a, b] = &acquisition.tiles[..] else {
+        panic!("two tiles")
+    };
+    let solved = b.aligned.zip(a.aligned);
+    let solved = solved.map(|(b, a)| corner(b) - corner(a));
+    (corner(b.stage) - corner(a.stage), solved)
+}
+
+#[test]
+fn tile_configurations_come_with_what_was_registered() {
+    let folder = two_pictures();
+    let at = |file: &str| folder.path().join(file);
+    let tiles = |x: f64, y: f64| format!("dim = 2\na.tif; ; (0, 0)\nb.tif; ; ({x}, {y})\n");
+    fs::write(at("TileConfiguration.txt"), tiles(27.0, 0.0)).unwrap();
+    let stage = found(folder.path());
+    assert_eq!(steps(&stage), (DVec2::new(27.0, 0.0), None));
+
+    fs::write(at("TileConfiguration.registered.txt"), tiles(25.5, 1.25)).unwrap();
+    let solved = found(folder.path());
+    assert!(solved.list.ends_with("TileConfiguration.txt"));
+    let registered = solved.solution.as_ref().unwrap();
+    assert!(registered.ends_with("TileConfiguration.registered.txt"));
+    let want = (DVec2::new(27.0, 0.0), Some(DVec2::new(25.5, 1.25)));
+    assert_eq!(steps(&solved), want);
+
+    // Without the stage's, the registered one is a list like any other.
+    fs::remove_file(at("TileConfiguration.txt")).unwrap();
+    let alone = found(folder.path());
+    assert_eq!(steps(&alone), (DVec2::new(25.5, 1.25), None));
+}
+
+#[test]
+fn tile_specs_hold_stage_and_solution() {
+    let folder = two_pictures();
+    let spec = |name: &str, stage: [f64; 2], affine: &str| {
+        format!(
+            r#"{{"tileId": "{name}.1", "z": 1015.0, "width": 30.0, "height": 20.0,
+                 "layout": {{"stageX": {}, "stageY": {}}},
+                 "mipmapLevels": {{"0": {{"imageUrl": "file:/elsewhere/{name}.tif"}}}},
+                 "transforms": {{"type": "list", "specList": [{{
+                     "className": "mpicbg.trakem2.transform.AffineModel2D",
+                     "dataString": "{affine}"}}]}}}}"#,
+            stage[0], stage[1]
+        )
+    };
+    let write = |b: &str| {
+        let specs = [
+            spec("a", [1000.0, 500.0], "1 0 0 1 0 0"),
+            spec("b", [1027.0, 500.0], b),
+        ];
+        fs::write(
+            folder.path().join("specs.json"),
+            format!("[{}]", specs.join(",")),
+        )
+        .unwrap();
+    };
+    fs::write(folder.path().join("other.json"), r#"{"microscope": 7}"#).unwrap();
+    write("1 0.01 -0.01 1 26 2");
+    let acquisition = found(folder.path());
+    assert!(acquisition.list.ends_with("specs.json"));
+    assert_eq!(acquisition.extent.z, 1, "sections count from the first");
+    let want = (DVec2::new(27.0, 0.0), Some(DVec2::new(26.0, 2.0)));
+    assert_eq!(steps(&acquisition), want);
+    let turned = acquisition.tiles[1].aligned.unwrap().elements();
+    assert_eq!(turned[..4], [1.0, 0.01, -0.01, 1.0]);
+
+    // A solution that says what the stage says is none.
+    write("1 0 0 1 27 0");
+    assert_eq!(found(folder.path()).solution, None);
+}
+
 #[test]
 fn a_replay_goes_on_where_it_was_and_ends_with_the_solution() {
     let input = acquisition();

@@ -37,7 +37,8 @@ struct Tissue {
     phantom: bool,
 
     /// Simulate from a registered stack (a folder of PNG or TIFF sections, a multi-page TIFF, an
-    /// OME-Zarr), or replay a real acquisition (a tile list and its images)
+    /// OME-Zarr), or replay a real acquisition (its images, and a list of `file x y z`, a Fiji
+    /// tile configuration or Render tile specifications)
     #[arg(long, value_name = "DIR")]
     input: Option<PathBuf>,
 }
