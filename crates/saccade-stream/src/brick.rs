@@ -10,7 +10,7 @@ use saccade_core::levels::Level;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::BrickVoxels;
-use saccade_source::{Chunk, ChunkId};
+use saccade_source::{Chunk, ChunkId, ValueRange};
 
 const EDGE: usize = BRICK_STORED_EDGE as usize;
 
@@ -39,6 +39,21 @@ pub fn chunks_of(id: BrickId, volume: &Volume) -> impl Iterator<Item = ChunkId> 
         level,
         chunk,
     })
+}
+
+/// Bounds of the measured voxels of a brick and its border, if `range` knows those of all its chunks.
+pub fn range_of(
+    id: BrickId,
+    volume: &Volume,
+    range: impl Fn(ChunkId) -> Option<ValueRange>,
+) -> Option<ValueRange> {
+    let join = |a: ValueRange, b: ValueRange| ValueRange {
+        min: a.min.min(b.min),
+        max: a.max.max(b.max),
+    };
+    let mut ranges = chunks_of(id, volume).map(range);
+    let first = ranges.next()??;
+    ranges.try_fold(first, |all, range| Some(join(all, range?)))
 }
 
 /// Assembles bricks one after another in the same memory.

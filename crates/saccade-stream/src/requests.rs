@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use futures::StreamExt;
 use futures::future::{AbortHandle, Aborted, abortable};
 use saccade_source::maybe_send::{MaybeSend, spawn};
-use saccade_source::{Change, Chunk, ChunkError, VolumeSource};
+use saccade_source::{Change, Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
 use tokio::sync::Notify;
 
 use crate::histogram::{Sample, sample};
@@ -102,6 +102,11 @@ impl Requests {
                 handle.abort();
             }
         }
+    }
+
+    /// Bounds of a chunk's values, if the source knows them without reading it.
+    pub(crate) fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
+        self.source.value_range(id)
     }
 
     /// Starts counting values; an earlier count that has not ended is dropped.

@@ -1,11 +1,12 @@
 //! A source, a renderer and the pull between them.
 
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
 use glam::UVec2;
+use saccade_core::brick::BrickId;
 use saccade_core::transfer::{Histogram, TransferFunction};
 use saccade_core::volume::Volume;
 use saccade_render::wgpu::DeviceType;
@@ -15,10 +16,14 @@ use saccade_render::{
 };
 use saccade_source::VolumeSource;
 
+use crate::brick::range_of;
 use crate::clock::Clock;
 use crate::policy::{Limits, Pace, Refresh, Retry};
 use crate::pull::{Freshness, Progress, Pull};
 use crate::requests::{Event, Requests};
+
+/// Bricks whose bounds were told, kept in mind; beyond, all are forgotten and told again.
+const MOST_TOLD: usize = 1 << 16;
 
 /// Called, from any thread, when [`Session::frame`] would find something new.
 pub type Wake = Arc<dyn Fn() + Send + Sync>;
@@ -138,6 +143,8 @@ pub struct Session {
     transfer_is_automatic: bool,
     frames_in_flight: usize,
     retry: Retry,
+    /// Bricks whose bounds the renderer was told since they last changed.
+    told: HashSet<BrickId>,
     /// Frames without a report.
     pending: VecDeque<Submitted>,
     drawn: u64,
@@ -208,6 +215,7 @@ impl Session {
             transfer,
             transfer_is_automatic: true,
             frames_in_flight: options.frames_in_flight.max(1),
+            told: HashSet::new(),
             pending: VecDeque::new(),
             drawn: 0,
             drawn_view: None,
@@ -261,6 +269,10 @@ impl Session {
 
     fn put_transfer_function(&mut self, transfer: TransferFunction) {
         if self.transfer != transfer {
+            // The renderer forgets what it knows when values are stored the other way round.
+            if self.transfer.polarity != transfer.polarity {
+                self.told.clear();
+            }
             self.renderer.set_transfer_function(&transfer);
             self.transfer = transfer;
             self.dirty = true;
@@ -340,6 +352,7 @@ impl Session {
                     self.revision = self.revision.max(change.revision);
                     self.pull.change(change.voxels);
                     self.renderer.invalidate(change.voxels);
+                    self.told.clear();
                     self.refresh.changed();
                     self.dirty = true;
                 }
@@ -362,9 +375,40 @@ impl Session {
             self.known_at = Some(now);
             self.frame_size = known.size;
         }
-        self.pull.want(report.frame, &report.misses);
-        self.dirty |= report.redraw;
+        let hidden = self.hidden(&report.misses);
+        if hidden.is_empty() {
+            self.pull.want(report.frame, &report.misses);
+        } else {
+            let seen = report.misses.iter().filter(|id| !hidden.contains(id));
+            self.pull
+                .want(report.frame, &seen.copied().collect::<Vec<_>>());
+        }
+        // Without what is hidden, the next frame may be complete.
+        self.dirty |= report.redraw || !hidden.is_empty();
         self.report = Some(report);
+    }
+
+    /// Of the bricks missed, those that the source knows to hold nothing that can be seen. The
+    /// renderer is told, once: a brick that is missed again is needed.
+    fn hidden(&mut self, misses: &[BrickId]) -> HashSet<BrickId> {
+        if self.told.len() > MOST_TOLD {
+            self.told.clear();
+        }
+        let mut hidden = HashSet::new();
+        for &id in misses {
+            if !self.told.insert(id) {
+                continue;
+            }
+            let volume = self.renderer.volume().clone();
+            let range = range_of(id, &volume, |chunk| self.requests.value_range(chunk));
+            let range = range.map(|range| [range.min, range.max].map(u8::try_from));
+            if let Some([Ok(min), Ok(max)]) = range
+                && self.renderer.note_range(id, [min, max])
+            {
+                hidden.insert(id);
+            }
+        }
+        hidden
     }
 
     /// Hands ready bricks to the renderer; whether there may be more.

@@ -12,13 +12,13 @@ use std::time::Duration;
 
 use glam::{DVec3, UVec2, UVec3};
 use saccade_core::camera::Camera;
-use saccade_core::transfer::TransferFunction;
-use saccade_core::volume::Volume;
+use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
+use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{Gpu, Image, View};
 use saccade_source::maybe_send::{BoxFuture, BoxStream};
 use saccade_source::memory::ArraySource;
-use saccade_source::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
+use saccade_source::{Change, Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
 use saccade_stream::policy::{Limits, Retry};
 use saccade_stream::{Again, Session, SessionOptions, SettleError};
 
@@ -285,4 +285,90 @@ async fn the_users_transfer_function_stays() {
     assert_eq!(session.transfer_function(), &chosen);
     session.set_automatic_transfer_function();
     assert!(picture(&mut session, &view).await == automatic);
+}
+
+/// Counts reads, and tells values of chunks without one, or keeps them to itself.
+struct Ranged {
+    inner: ArraySource,
+    reads: AtomicU64,
+    tells: bool,
+}
+
+impl VolumeSource for Ranged {
+    fn volume(&self) -> &Arc<Volume> {
+        self.inner.volume()
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        self.reads.fetch_add(1, Ordering::Relaxed);
+        self.inner.read(id)
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.inner.changes()
+    }
+
+    fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
+        self.tells.then(|| self.inner.value_range(id))?
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_a_source_knows_to_be_hidden_is_not_read() {
+    let Some(gpu) = test_gpu().await else { return };
+    let extent = UVec3::new(150, 140, 70);
+    let volume = Volume::new("corner", extent, DVec3::splat(4.0)).unwrap();
+    let volume = Volume {
+        chunk: UVec3::splat(32),
+        ..volume
+    };
+    let corner = |at: UVec3| {
+        if at.cmplt(UVec3::splat(20)).all() {
+            230
+        } else {
+            30
+        }
+    };
+    let voxels: Vec<u8> = VoxelBox::of_size(extent).iter().map(corner).collect();
+    let point = |value, opacity| OpacityPoint { value, opacity };
+    let transfer = TransferFunction {
+        polarity: Polarity::Bright,
+        color_map: ColorMap::Gray,
+        window: [0.0, 1.0],
+        opacity: vec![point(0.4, 0.0), point(0.6, 0.8)],
+        opacity_length_nm: 20.0,
+    };
+    let mut seen = Vec::new();
+    for tells in [true, false] {
+        let source = Arc::new(Ranged {
+            inner: ArraySource::new(volume.clone(), voxels.clone()).unwrap(),
+            reads: AtomicU64::new(0),
+            tells,
+        });
+        let view = View {
+            lod_bias: -2.0,
+            ..view(&*source)
+        };
+        let mut session = Session::new(&gpu, source.clone(), options()).unwrap();
+        session.set_transfer_function(transfer.clone());
+        let image = picture(&mut session, &view).await;
+        seen.push((image, source.reads.load(Ordering::Relaxed)));
+    }
+    let [(with, few), (without, many)] = &seen[..] else {
+        unreachable!()
+    };
+    assert!(
+        with.rgba.chunks_exact(4).any(|p| p[0] > 50),
+        "something is seen"
+    );
+    let differences = with
+        .rgba
+        .iter()
+        .zip(&without.rgba)
+        .map(|(a, b)| a.abs_diff(*b));
+    assert!(differences.max() <= Some(1), "the same picture");
+    assert!(
+        few * 2 < *many,
+        "{few} chunks were read, and {many} without ranges"
+    );
 }
