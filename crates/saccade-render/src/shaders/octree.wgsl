@@ -50,7 +50,8 @@ fn is_range_hidden(low: u32, high: u32) -> bool {
     return transfer.opaque_before[high + 1u] == transfer.opaque_before[low];
 }
 
-// The largest node around a sample of a level that is hidden or all alike, else the deepest there.
+// The largest node around a sample of a level that is hidden, all alike or nearly all seen, else the
+// deepest there.
 //
 // Starts from the nodes that the sample before was in [001 section 9.4]: those it shares with it
 // were neither.
@@ -82,9 +83,11 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
                 let range = nodes[known + NODE_RANGE];
                 low = range & 0xffffu;
                 high = range >> 16u;
-                hidden = (nodes[known + NODE_BINS] & transfer.visible_bins) == 0u
-                    || is_range_hidden(low, high);
-                if hidden || low == high {
+                let bins = nodes[known + NODE_BINS];
+                let visible = countOneBits(bins & transfer.visible_bins);
+                hidden = visible == 0u || is_range_hidden(low, high);
+                // Where nearly all is seen, a closer look finds little to skip.
+                if hidden || low == high || visible * 4u > countOneBits(bins) * 3u {
                     break;
                 }
             }
