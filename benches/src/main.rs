@@ -9,8 +9,10 @@
     reason = "a program that reports to its terminal"
 )]
 
+mod bricks;
 mod clock;
 mod cpu;
+mod dense;
 mod machine;
 mod report;
 mod rows;

@@ -8,6 +8,7 @@ mod render;
 mod resample;
 mod section;
 mod serve;
+mod versus;
 
 use anyhow::Result;
 
@@ -55,6 +56,18 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: serve::NGINX_IDS,
         measure: serve::measure_nginx,
+    },
+    Group {
+        ids: versus::DENSE_IDS,
+        measure: versus::vs_dense_texture,
+    },
+    Group {
+        ids: versus::SMALL_IDS,
+        measure: versus::vs_small_volume,
+    },
+    Group {
+        ids: versus::PAGE_TABLES_IDS,
+        measure: versus::vs_page_tables,
     },
 ];
 
