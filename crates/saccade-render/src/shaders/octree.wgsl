@@ -120,7 +120,8 @@ fn levels_around(cell: vec3u) -> u32 {
         levels |= nodes[known + NODE_VALID];
         let children = nodes[first + NODE_CHILDREN];
         if children == 0u || at + 1u >= MOST_DEPTHS {
-            return levels | resident;
+            levels |= resident;
+            break;
         }
         levels |= resident & frame.octree.depths[at].residency;
         at += 1u;
