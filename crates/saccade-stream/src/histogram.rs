@@ -14,6 +14,8 @@ use crate::policy::Retry;
 
 /// Chunks read of the coarsest level, to find where data are.
 const COARSE_CHUNKS: usize = 8;
+/// Finer levels are searched where they have so many chunks at most.
+const SEARCHED_CHUNKS: u64 = 4096;
 /// Chunks counted.
 const COUNTED_CHUNKS: usize = 12;
 /// The counted level has at most so many voxels along an axis: about what a first look shows.
@@ -41,27 +43,26 @@ pub async fn sample(source: &dyn VolumeSource, retry: Retry) -> Sample {
     let Some((coarsest, counted)) = levels(volume) else {
         return result;
     };
-    let all = VoxelBox::of_size(volume.chunks(coarsest as usize)).iter();
-    let all: BTreeSet<Ordered> = all.map(|chunk| ordered(coarsest, chunk)).collect();
     let mut places = BTreeSet::new();
-    for (id, chunk) in read(
-        source,
-        retry,
-        spread(&all, COARSE_CHUNKS),
-        &mut result.partial,
-    )
-    .await
-    {
-        places.extend(places_with_data(volume, id, &chunk, counted));
+    // One damaged tile spoils every coarse chunk it is in: where data are, finer ones tell as well.
+    for level in (counted..=coarsest).rev() {
+        let chunks = VoxelBox::of_size(volume.chunks(level as usize));
+        if level < coarsest && chunks.voxels() > SEARCHED_CHUNKS {
+            break;
+        }
+        let all: BTreeSet<Ordered> = chunks.iter().map(|chunk| ordered(level, chunk)).collect();
+        let chosen = spread(&all, COARSE_CHUNKS);
+        let (read, failed) = read(source, retry, chosen, &mut result.partial).await;
+        for (id, chunk) in read {
+            places.extend(places_with_data(volume, id, &chunk, counted));
+        }
+        if !places.is_empty() || failed == 0 {
+            break;
+        }
     }
-    for (id, chunk) in read(
-        source,
-        retry,
-        spread(&places, COUNTED_CHUNKS),
-        &mut result.partial,
-    )
-    .await
-    {
+    let chosen = spread(&places, COUNTED_CHUNKS);
+    let (read, _) = read(source, retry, chosen, &mut result.partial).await;
+    for (id, chunk) in read {
         count(volume, id, &chunk, &mut result.histogram);
     }
     result
@@ -114,27 +115,31 @@ async fn read_patiently(
     }
 }
 
+/// The chunks that hold something, and how many could not be read.
 async fn read(
     source: &dyn VolumeSource,
     retry: Retry,
     ids: Vec<ChunkId>,
     partial: &mut bool,
-) -> Vec<(ChunkId, Vec<u8>)> {
+) -> (Vec<(ChunkId, Vec<u8>)>, usize) {
     let read = |id| async move { (id, read_patiently(source, retry, id).await) };
     let reads: Vec<_> = ids.into_iter().map(read).collect();
     let answers: Vec<_> = futures::stream::iter(reads)
         .buffered(CONCURRENT)
         .collect()
         .await;
-    let mut chunks = Vec::new();
+    let (mut chunks, mut failed) = (Vec::new(), 0);
     for (id, answer) in answers {
         match answer {
             Ok(Chunk::Voxels(voxels)) => chunks.push((id, voxels.to_vec())),
             Ok(Chunk::Empty) => {}
-            Err(error) => *partial |= error.is_transient(),
+            Err(error) => {
+                *partial |= error.is_transient();
+                failed += 1;
+            }
         }
     }
-    chunks
+    (chunks, failed)
 }
 
 /// Rows of the chunk's voxels inside of the volume, with the first voxel of each.
@@ -285,6 +290,47 @@ mod tests {
         fn changes(&self) -> BoxStream<'static, Change> {
             self.inner.changes()
         }
+    }
+
+    /// Has lost a tile: the chunks of the coarsest level fail for good, and one of each other.
+    struct Damaged(ArraySource);
+
+    impl VolumeSource for Damaged {
+        fn volume(&self) -> &Arc<Volume> {
+            self.0.volume()
+        }
+
+        fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+            let coarsest = id.level as usize + 1 == self.volume().levels.len();
+            if coarsest || id.chunk == UVec3::ZERO {
+                let source = Arc::new(std::io::Error::other("damaged"));
+                return Box::pin(async move {
+                    Err(ChunkError::Failed {
+                        id,
+                        transient: false,
+                        source,
+                    })
+                });
+            }
+            self.0.read(id)
+        }
+
+        fn changes(&self) -> BoxStream<'static, Change> {
+            self.0.changes()
+        }
+    }
+
+    #[test]
+    fn what_is_damaged_does_not_hide_the_rest() {
+        let inner = source(
+            UVec3::new(1300, 90, 40),
+            |at| if at.x > 600 { 77 } else { 0 },
+        );
+        assert!(inner.volume().levels.len() > 2);
+        let Sample { histogram, partial } = take(&Damaged(inner));
+        assert!(!partial, "asking again would not help");
+        assert!(histogram.total() > 0);
+        assert!(histogram.counts()[77] > histogram.total() / 2);
     }
 
     #[test]
