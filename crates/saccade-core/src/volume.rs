@@ -3,6 +3,7 @@
 use glam::{DVec3, UVec3};
 use serde::{Deserialize, Serialize};
 
+use crate::brick::{BRICK_EDGE, MAX_BRICKS_PER_AXIS};
 use crate::levels::{Level, halving_levels};
 use crate::space::{Map, Normalised, Physical, Voxel};
 
@@ -56,6 +57,14 @@ pub enum VolumeError {
         /// As given \[voxels\].
         extent: UVec3,
     },
+    /// An axis longer than brick ids reach.
+    #[error("the volume's extent is {extent}, but an axis can have {most} voxels at most")]
+    ExtentTooLarge {
+        /// As given \[voxels\].
+        extent: UVec3,
+        /// Largest possible \[voxels\].
+        most: u32,
+    },
     /// The name cannot be used in addresses and file names.
     #[error(
         "{name:?} cannot name a volume: use 1 to 100 letters, digits, '-', '_' and '.', and do not \
@@ -72,6 +81,9 @@ pub enum VolumeError {
         voxel_nm: DVec3,
     },
 }
+
+/// Largest extent of an axis \[voxels\].
+pub const MAX_EXTENT: u32 = MAX_BRICKS_PER_AXIS * BRICK_EDGE;
 
 /// Checks that a name can be used in addresses and file names: 1 to 100 ASCII letters, digits, `-`,
 /// `_` and `.`, the first not `.`. [`Volume::new`] does not: whoever takes a name in does.
@@ -100,6 +112,10 @@ impl Volume {
     pub fn new(name: &str, extent: UVec3, voxel_nm: DVec3) -> Result<Self, VolumeError> {
         if extent.min_element() == 0 {
             return Err(VolumeError::Extent { extent });
+        }
+        if extent.max_element() > MAX_EXTENT {
+            let most = MAX_EXTENT;
+            return Err(VolumeError::ExtentTooLarge { extent, most });
         }
         if !(voxel_nm.is_finite() && voxel_nm.min_element() > 0.0) {
             return Err(VolumeError::VoxelSize { voxel_nm });
@@ -184,6 +200,9 @@ mod tests {
     fn impossible_volumes_are_refused() {
         let nm = DVec3::splat(4.0);
         assert!(Volume::new("v", UVec3::new(4, 0, 4), nm).is_err());
+        assert!(Volume::new("v", UVec3::new(1, MAX_EXTENT, 1), nm).is_ok());
+        let beyond = Volume::new("v", UVec3::new(1, 1, MAX_EXTENT + 1), nm);
+        assert!(matches!(beyond, Err(VolumeError::ExtentTooLarge { .. })));
         assert!(Volume::new("v", UVec3::ONE, DVec3::new(1.0, -1.0, 1.0)).is_err());
         assert!(Volume::new("v", UVec3::ONE, DVec3::NAN).is_err());
     }

@@ -183,6 +183,12 @@ enum Refusal {
 }
 
 fn build(path: &Path, record: &TileRecord, encoding: Encoding) -> Result<Bytes, Refusal> {
+    // Reading a pipe waits for ever, and some devices never end.
+    if fs::metadata(path).is_ok_and(|meta| !meta.is_file()) {
+        let reason = "this is no regular file (a folder, a pipe or a device); put the image itself \
+                      there, and append the record again";
+        return Err(Refusal::Never(reason.to_owned()));
+    }
     let image = image::decode_file(path).map_err(|e| match e {
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
         ImageError::Broken { .. } => Refusal::Broken(e.to_string()),
@@ -265,10 +271,7 @@ impl Backoff {
         error: &(dyn std::error::Error + Send + Sync + 'static),
     ) {
         if self.failures == 1 {
-            progress.notice(&format!(
-                "{}; trying again until it works",
-                with_sources(error)
-            ));
+            progress.notice(&format!("{}; trying again", with_sources(error)));
         }
         tokio::time::sleep(self.pause).await;
         self.pause = (self.pause * 2).min(self.longest);

@@ -30,6 +30,9 @@ const COMMIT_AT_ONCE: usize = 64;
 /// Retired pyramids deleted per look.
 const DELETE_AT_ONCE: u32 = 64;
 
+/// Attempts at reading the records when all that is there is to be done once.
+const ATTEMPTS_ONCE: u32 = 4;
+
 /// What was done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Summary {
@@ -195,7 +198,9 @@ impl Ingest<'_> {
             match self.reader.read(self.options.batch.max(1)) {
                 Ok(lines) => return Ok(lines),
                 Err(e) => {
-                    let passing = matches!(e, AcquisitionError::Read { .. });
+                    // Who waits for the end is told, rather than kept.
+                    let patient = !self.options.once || backoff.failures < ATTEMPTS_ONCE;
+                    let passing = patient && matches!(e, AcquisitionError::Read { .. });
                     if !backoff.may_go_on(false, passing) {
                         return Err(e.into());
                     }

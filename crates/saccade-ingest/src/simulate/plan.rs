@@ -10,7 +10,7 @@ use std::f64::consts::TAU;
 use glam::{DVec2, UVec2, UVec3};
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::check_name;
+use saccade_core::volume::{MAX_EXTENT, check_name};
 
 use super::stack::StackInfo;
 use super::{SimulateConfig, SimulateError};
@@ -89,6 +89,10 @@ impl Plan {
         super::check_rate_and_voxel(config.rate_mpixel_s, voxel_nm)?;
         let name = config.name.clone().unwrap_or_else(|| stack.name.clone());
         check_name(&name)?;
+        if stack.extent.max_element() > MAX_EXTENT {
+            let must = "at most 2,097,152 voxels along each axis";
+            return wrong("the extent", &stack.extent, must);
+        }
         let size = config.tile.as_dvec2();
         let overlap = size * config.overlap;
         // A pixel stays in reserve on each side, so that rounding never uncovers a voxel.

@@ -39,7 +39,7 @@ impl StackInfo {
     /// The voxel size \[nm\], or what is common where the stack does not say: 4 x 4 x 40 nm for a few
     /// wide sections, as cut with a knife; 8 nm along each axis for a cube, as milled with a beam.
     pub fn voxel_nm_or_assumed(&self) -> DVec3 {
-        let wide = self.extent.x.max(self.extent.y) > 4 * self.extent.z;
+        let wide = self.extent.x.max(self.extent.y) > self.extent.z.saturating_mul(4);
         let assumed = if wide {
             DVec3::new(4.0, 4.0, 40.0)
         } else {

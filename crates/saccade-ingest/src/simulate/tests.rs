@@ -591,6 +591,11 @@ fn other_settings_do_not_go_on() {
 
 #[test]
 fn bad_settings_and_folders_are_refused() {
+    let beyond = UVec3::new(u32::MAX, 40, u32::MAX);
+    let huge = PhantomStack::new(1, beyond, DVec3::ONE).unwrap();
+    let refused = Plan::new(&SimulateConfig::default(), huge.info()).unwrap_err();
+    assert!(refused.to_string().contains("2,097,152"), "{refused}");
+
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
     let attempt = |config: &SimulateConfig, path: &Path| {

@@ -139,6 +139,18 @@ async fn an_empty_file() {
     says(&what, &["has not changed"]);
 }
 
+/// Decoding it would never end.
+#[cfg(unix)]
+#[tokio::test]
+async fn a_device_in_place_of_an_image() {
+    let what = refused(|scope| {
+        std::os::unix::fs::symlink("/dev/zero", scope.file("device")).unwrap();
+        scope.say(&tile_record("device", 0, SIZE));
+    })
+    .await;
+    says(&what, &["no regular file", "append the record again"]);
+}
+
 #[tokio::test]
 async fn a_file_that_never_comes() {
     let what = refused(|scope| scope.say(&tile_record("ghost", 0, SIZE))).await;
