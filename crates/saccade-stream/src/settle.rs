@@ -12,7 +12,7 @@ use crate::session::{Again, Session, Status};
 #[non_exhaustive]
 pub enum SettleError {
     /// Data did not arrive in time. The picture shows what did.
-    #[error("after {waited:?}, {} bricks are still missing", status.fidelity.missing)]
+    #[error("after {waited:?}, {} bricks are still missing{}", status.fidelity.missing, so_far(status))]
     Timeout {
         /// As allowed.
         waited: Duration,
@@ -36,6 +36,13 @@ fn failure(status: &Status) -> &str {
         .failure
         .as_deref()
         .unwrap_or("no reason was given")
+}
+
+fn so_far(status: &Status) -> String {
+    let failure = status.progress.failure.as_deref();
+    failure.map_or_else(String::new, |failure| {
+        format!("; the last failure: {failure}")
+    })
 }
 
 /// Longest wait for news, in case a wake-up was lost.

@@ -267,6 +267,19 @@ async fn a_source_that_never_answers_is_not_waited_for() {
         .await
         .unwrap_err();
     assert!(matches!(error, SettleError::Timeout { .. }), "{error}");
+    assert!(!error.to_string().contains("failure"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_waited_in_vain_learns_what_failed() {
+    let Some(gpu) = test_gpu().await else { return };
+    let broken = Arc::new(Unreliable::new(|_, id| Err(failed(id, true))));
+    let view = view(&*broken);
+    let mut session = Session::new(&gpu, broken, options()).unwrap();
+    let waited = Duration::from_millis(500);
+    let error = session.settle(&view, waited).await.unwrap_err();
+    assert!(matches!(error, SettleError::Timeout { .. }), "{error}");
+    assert!(error.to_string().contains("unplugged"), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

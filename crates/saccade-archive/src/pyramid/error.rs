@@ -14,7 +14,10 @@ pub enum PyramidError {
         name: String,
     },
     /// The file is no pyramid, or is damaged.
-    #[error("the pyramid is damaged ({reason}); delete it and ingest the tile again: {name}")]
+    #[error(
+        "the pyramid is damaged ({reason}); append the tile's record to its acquisition \
+         once more, and ingest makes it anew: {name}"
+    )]
     Broken {
         /// What is wrong.
         reason: String,

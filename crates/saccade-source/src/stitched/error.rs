@@ -21,7 +21,8 @@ pub enum StitchError {
     },
     /// A tile's pyramid is not of the size that the catalog says.
     #[error(
-        "the pyramid is of {got} pixels, the catalog says {expected}; ingest the tile again: {name}"
+        "the pyramid is of {got} pixels, the catalog says {expected}; append the tile's \
+         record to its acquisition once more: {name}"
     )]
     Size {
         /// As the catalog says \[pixels\].
@@ -32,7 +33,10 @@ pub enum StitchError {
         name: String,
     },
     /// A tile's pyramid is shorter than its index says.
-    #[error("the pyramid ends early; delete it and ingest the tile again: {name}")]
+    #[error(
+        "the pyramid ends early; append the tile's record to its acquisition \
+         once more, and ingest makes it anew: {name}"
+    )]
     Cut {
         /// The file.
         name: String,

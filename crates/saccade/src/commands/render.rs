@@ -14,7 +14,7 @@ use saccade_view::background_from_text;
 
 use crate::arguments::{picture, picture_size, seconds};
 use crate::open::Place;
-use crate::report::tell;
+use crate::report::{say, tell};
 
 /// Draw a volume into a PNG file. Waits until the picture is complete.
 #[derive(Args)]
@@ -122,6 +122,9 @@ impl Render {
         )
         .with_context(|| format!("cannot write the picture {}", self.output.display()))?;
         tell(&fidelity(&status));
+        if let Some(failure) = &status.progress.failure {
+            say(&format!("not all could be read: {failure}"));
+        }
         Ok(())
     }
 
