@@ -55,10 +55,10 @@ pub(crate) fn measure_slowloris() -> Result<Vec<Row>> {
             attackers.spawn(slow_client(served.address, index, slow));
         }
         // All are connected, and have begun to send.
-        client.block_on(tokio::time::sleep(3 * BYTE));
+        client.block_on(async { tokio::time::sleep(3 * BYTE).await });
         let attacked = client.block_on(good_client(served.address, &keys))?;
         attackers.shutdown_background();
-        client.block_on(tokio::time::sleep(BYTE));
+        client.block_on(async { tokio::time::sleep(BYTE).await });
         ratios.push(attacked / idle);
         p99[0].push(idle * 1e3);
         p99[1].push(attacked * 1e3);
