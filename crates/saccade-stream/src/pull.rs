@@ -131,7 +131,7 @@ struct Loaded {
     chunk: Chunk,
     /// Whether its voxels changed after it was asked for.
     outdated: bool,
-    /// Answers there were before it.
+    /// The number of its answer; 0 if it comes from the cache.
     arrived: u64,
 }
 
