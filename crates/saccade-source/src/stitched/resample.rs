@@ -1,6 +1,8 @@
 //! From decoded sub-tiles to samples.
 
 mod line;
+#[cfg(target_arch = "x86_64")]
+mod wide;
 
 use bytes::Bytes;
 use glam::{DVec2, UVec2};

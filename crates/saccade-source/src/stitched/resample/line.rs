@@ -3,7 +3,7 @@
 //! Sections are turned by a few degrees at most, so neighbouring samples mostly lie between
 //! neighbouring pixels: a line falls into runs in which pixels lie as the samples do and only the
 //! weights change. Runs need no gathering. Where they would be short, pixels are gathered one by one,
-//! and only the arithmetic is shared.
+//! and only the arithmetic is shared. [`super::wide`] does the same faster where it can.
 //!
 //! Weights along x have 8 bits, those along y 16, slopes at least 16: a result is less than one grey
 //! level from what is exact.
@@ -11,7 +11,7 @@
 /// Samples that are interpolated at once.
 const LANES: usize = 16;
 /// Bits after the point of positions.
-const BITS: u32 = 32;
+pub(super) const BITS: u32 = 32;
 /// Samples of a run, at most, as slopes are rounded to 2^-16 pixels.
 const LONGEST_RUN: usize = 64;
 /// Lines whose runs are shorter on average are gathered.
@@ -27,8 +27,8 @@ pub(super) const MARGIN: usize = LANES + 1;
 pub(super) struct Line {
     x: i64,
     y: i64,
-    dx: i64,
-    dy: i64,
+    pub(super) dx: i64,
+    pub(super) dy: i64,
 }
 
 impl Line {
@@ -59,18 +59,18 @@ impl Line {
         }
     }
 
-    fn step(&mut self, samples: usize) {
+    pub(super) fn step(&mut self, samples: usize) {
         self.x += self.dx * samples as i64;
         self.y += self.dy * samples as i64;
     }
 
     /// Number of the pixel to the upper left.
-    fn pixel(&self, width: usize) -> usize {
+    pub(super) fn pixel(&self, width: usize) -> usize {
         whole(self.y, BITS) * width + whole(self.x, BITS)
     }
 
     /// What follows the point \[2^-16 pixels\].
-    fn weights(&self) -> [u16; 2] {
+    pub(super) fn weights(&self) -> [u16; 2] {
         [self.x, self.y].map(|v| low(v >> (BITS - 16)))
     }
 }
@@ -91,7 +91,7 @@ fn low(value: i64) -> u16 {
 }
 
 /// Rounded to 2^-16 pixels.
-fn rounded(slope: i64) -> i64 {
+pub(super) fn rounded(slope: i64) -> i64 {
     (slope + (1 << (BITS - 17))) >> (BITS - 16)
 }
 
@@ -133,12 +133,19 @@ fn lerp_at(top: [u8; 2], bottom: [u8; 2], right: u16, wy: u16) -> u8 {
 
 /// Interpolates in an image, `width` pixels wide, with [`MARGIN`] bytes behind its end. All samples
 /// must lie between its pixels.
-pub(super) fn interpolate(values: &[u8], width: usize, line: Line, out: &mut [u8]) {
+pub(super) fn interpolate(values: &[u8], width: usize, mut line: Line, mut out: &mut [u8]) {
     let one = 1_i64 << BITS;
     let slips = (line.dx - one).abs() + line.dy.abs();
     if slips == 0 {
-        shifted(values, width, line, out);
-    } else if slips.saturating_mul(SHORT_RUN) < one {
+        return shifted(values, width, line, out);
+    }
+    #[cfg(target_arch = "x86_64")]
+    {
+        let done = super::wide::interpolate(values, width, line, out);
+        line.step(done);
+        out = &mut out[done..];
+    }
+    if slips.saturating_mul(SHORT_RUN) < one {
         in_runs(values, width, line, out);
     } else {
         gathered(values, width, line, out);
@@ -213,7 +220,7 @@ fn lerp_run(
     }
 }
 
-fn gathered(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
+pub(super) fn gathered(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
     // Of 16 bits after the point, so that pixels and the lanes' weights agree; anew for each LANES.
     let (dx, dy) = (rounded(line.dx), rounded(line.dy));
     let ramps = [dx, dy].map(ramp);
