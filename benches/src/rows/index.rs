@@ -173,6 +173,9 @@ async fn make(folder: &Path) -> Result<()> {
         .await?;
     let counted = "UPDATE volumes SET tiles = (SELECT count(*) FROM tiles), revision = (SELECT max(revision) FROM tiles)";
     sqlx::query(counted).execute(&mut connection).await?;
+    let sections = "INSERT INTO sections (volume, section, tiles) \
+                    SELECT volume, section, count(*) FROM tiles GROUP BY volume, section";
+    sqlx::query(sections).execute(&mut connection).await?;
     connection.close().await?;
     fs::rename(&unfinished, folder)?;
     Ok(())

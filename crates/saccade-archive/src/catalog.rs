@@ -15,7 +15,8 @@
 //! What a tile is follows from its records' positions, not from when they were worked on: the image
 //! comes from the tile record with the largest position, the transform from the tile or transform
 //! record with the largest. A transform that comes before the tile's first record is kept and
-//! applied to it.
+//! applied to it. A deletion ends what came before it: a tile record with a larger position brings
+//! the tile back, as if it were new.
 
 mod commit;
 mod error;
@@ -37,7 +38,7 @@ use tokio::sync::watch;
 
 use crate::acquisition::{Cursor, TileRecord};
 
-pub use commit::{Commit, TileOutcome, TransformOutcome};
+pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
 pub use error::CatalogError;
 
 /// Most changes that [`Catalog::changes_after`] returns at once.
@@ -57,6 +58,8 @@ pub struct Tile {
     pub name: String,
     /// Section: z index of the volume.
     pub section: u32,
+    /// Channel: index in the volume's channels.
+    pub channel: u32,
     /// Width and height \[pixels\].
     pub size: UVec2,
     /// Where it lies: to level-0 voxels from pixels.
@@ -74,6 +77,8 @@ pub struct NewTile {
     pub name: String,
     /// Section: z index of the volume.
     pub section: u32,
+    /// Channel: index in the volume's channels.
+    pub channel: u32,
     /// Width and height \[pixels\].
     pub size: UVec2,
     /// To level-0 voxels from pixels.
@@ -92,6 +97,8 @@ pub enum ChangeReason {
     Tile,
     /// A tile moved.
     Transform,
+    /// A tile was deleted.
+    Deleted,
 }
 
 /// Voxels that are no longer what they were.
@@ -345,8 +352,8 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what SQLite says.
     pub async fn section_tiles(&self, volume: &str, z: u32) -> Result<Vec<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT id, name, section, width, height, a, b, c, d, tx, ty, pyramid, revision \
-                     FROM tiles WHERE volume = ? AND section = ? ORDER BY id";
+        let query = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, pyramid, revision \
+                     FROM tiles WHERE volume = ? AND section = ? AND deleted = 0 ORDER BY id";
         let rows = sqlx::query(query)
             .bind(id)
             .bind(z)
@@ -364,8 +371,8 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what SQLite says.
     pub async fn tile(&self, volume: &str, name: &str) -> Result<Option<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT id, name, section, width, height, a, b, c, d, tx, ty, pyramid, revision \
-                     FROM tiles WHERE volume = ? AND name = ?";
+        let query = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, pyramid, revision \
+                     FROM tiles WHERE volume = ? AND name = ? AND deleted = 0";
         let row = sqlx::query(query)
             .bind(id)
             .bind(name)
@@ -385,9 +392,9 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what SQLite says.
     pub async fn tiles(&self, volume: &str, ids: &[TileId]) -> Result<Vec<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT id, name, section, width, height, a, b, c, d, tx, ty, pyramid, revision \
+        let query = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, pyramid, revision \
                      FROM tiles WHERE id IN (SELECT value FROM json_each(?)) AND volume = ? \
-                     ORDER BY id";
+                     AND deleted = 0 ORDER BY id";
         let ids = serde_json::to_string(ids).expect("numbers become JSON");
         let rows = sqlx::query(query)
             .bind(ids)
@@ -406,13 +413,7 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what SQLite says.
     pub async fn sections(&self, volume: &str) -> Result<Vec<u32>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        // Jumps from section to section in the index instead of reading every tile's entry.
-        let query = "WITH RECURSIVE s (z) AS ( \
-                       SELECT min(section) FROM tiles WHERE volume = ?1 \
-                       UNION ALL \
-                       SELECT (SELECT min(section) FROM tiles WHERE volume = ?1 AND section > s.z) \
-                       FROM s WHERE s.z IS NOT NULL) \
-                     SELECT z FROM s WHERE z IS NOT NULL";
+        let query = "SELECT section FROM sections WHERE volume = ? ORDER BY section";
         let sections = sqlx::query_scalar(query)
             .bind(id)
             .fetch_all(&self.inner.readers)
@@ -505,6 +506,23 @@ impl Catalog {
     ) -> Result<TransformOutcome, CatalogError> {
         let mut commit = self.begin(volume).await?;
         let outcome = commit.transform(tile, transform, None).await?;
+        commit.finish().await?;
+        Ok(outcome)
+    }
+
+    /// Deletes one tile in a transaction of its own. See [`Commit::delete`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Commit::delete`].
+    pub async fn delete_tile(
+        &self,
+        volume: &str,
+        tile: &str,
+        position: u64,
+    ) -> Result<DeleteOutcome, CatalogError> {
+        let mut commit = self.begin(volume).await?;
+        let outcome = commit.delete(tile, position, SystemTime::now()).await?;
         commit.finish().await?;
         Ok(outcome)
     }
@@ -610,8 +628,9 @@ impl Catalog {
         let id = self.volume_id(volume).await?;
         let count = "SELECT (SELECT count(*) FROM quarantine WHERE volume = ?1), \
                      (SELECT count(*) FROM waiting WHERE volume = ?1), \
-                     (SELECT count(*) FROM early_transforms WHERE volume = ?1)";
-        let counts = sqlx::query_as::<_, (i64, i64, i64)>(count).bind(id);
+                     (SELECT count(*) FROM early_transforms WHERE volume = ?1), \
+                     (SELECT count(*) FROM sections WHERE volume = ?1)";
+        let counts = sqlx::query_as::<_, (i64, i64, i64, i64)>(count).bind(id);
         let counts = counts
             .fetch_one(&self.inner.readers)
             .await
@@ -619,7 +638,7 @@ impl Catalog {
         Ok(Statistics {
             revision: entry.revision,
             tiles: entry.tiles,
-            sections: self.sections(volume).await?.len() as u64,
+            sections: counts.3.unsigned_abs(),
             quarantined: counts.0.unsigned_abs(),
             waiting: counts.1.unsigned_abs(),
             early: counts.2.unsigned_abs(),

@@ -11,8 +11,8 @@ use glam::{DVec2, DVec3, UVec2, UVec3};
 use proptest::prelude::*;
 use saccade_archive::acquisition::{Cursor, TileRecord};
 use saccade_archive::catalog::{
-    CHANGES_AT_ONCE, Catalog, CatalogChange, CatalogError, ChangeReason, Commit, NewTile,
-    Quarantined, Statistics, TileId, TileOutcome, TransformOutcome, Waiting, place,
+    CHANGES_AT_ONCE, Catalog, CatalogChange, CatalogError, ChangeReason, Commit, DeleteOutcome,
+    NewTile, Quarantined, Statistics, TileId, TileOutcome, TransformOutcome, Waiting, place,
 };
 use saccade_archive::{ArchiveError, VisualizationArchive};
 use saccade_core::transform::SectionFromTile;
@@ -33,6 +33,7 @@ fn tile(name: &str, section: u32, transform: SectionFromTile, position: u64) -> 
     NewTile {
         name: name.to_owned(),
         section,
+        channel: 0,
         size: SIZE,
         transform,
         pyramid: format!("tiles/{name}.{position}.tif"),
@@ -214,6 +215,147 @@ async fn an_early_transform_waits_for_its_tile() {
 }
 
 #[tokio::test]
+async fn a_deleted_tile_is_gone_until_a_later_record_brings_it_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    let begin = SystemTime::now() - Duration::from_secs(1);
+    let a = tile("a", 2, at(5.0, 6.0), 10);
+    catalog.commit_tile("v", &a).await.unwrap();
+    let id = catalog.tile("v", "a").await.unwrap().unwrap().id;
+    catalog
+        .commit_tile("v", &tile("b", 3, at(0.0, 0.0), 11))
+        .await
+        .unwrap();
+    catalog.quarantine("v", &broken("a")).await.unwrap();
+
+    let older = catalog.delete_tile("v", "a", 9).await.unwrap();
+    assert_eq!(older, DeleteOutcome::Unchanged);
+    let gone = catalog.delete_tile("v", "a", 20).await.unwrap();
+    assert_eq!(gone, DeleteOutcome::Deleted);
+    let again = catalog.delete_tile("v", "a", 21).await.unwrap();
+    assert_eq!(again, DeleteOutcome::Unchanged);
+    assert_eq!(catalog.tile("v", "a").await.unwrap(), None);
+    assert_eq!(catalog.tiles("v", &[id]).await.unwrap(), []);
+    assert_eq!(catalog.section_tiles("v", 2).await.unwrap(), []);
+    assert_eq!(catalog.sections("v").await.unwrap(), [3]);
+    assert_eq!(catalog.entry("v").await.unwrap().tiles, 1);
+    assert_eq!(catalog.quarantined("v").await.unwrap(), []);
+    let retired = catalog
+        .retired("v", SystemTime::now() + Duration::from_secs(9), 9)
+        .await
+        .unwrap();
+    assert_eq!(retired.len(), 1);
+    assert_eq!(retired[0].pyramid, a.pyramid);
+    assert!(retired[0].at > begin);
+    let changes = all_changes(&catalog).await;
+    let last = changes.last().unwrap();
+    let want = (3, id, 2, ChangeReason::Deleted);
+    assert_eq!((last.revision, last.tile, last.section, last.reason), want);
+    assert_eq!(last.voxels, place(EXTENT, 2, SIZE, at(5.0, 6.0)).unwrap());
+
+    // What was said before stays without effect, whenever it comes.
+    let late = catalog
+        .commit_tile("v", &tile("a", 2, at(0.0, 0.0), 15))
+        .await
+        .unwrap();
+    assert_eq!(late, TileOutcome::Superseded);
+    let mut commit = catalog.begin("v").await.unwrap();
+    let late = commit.transform("a", at(1.0, 1.0), Some(16)).await.unwrap();
+    assert_eq!(late, TransformOutcome::Unchanged);
+    // What is said later is of a new tile, with its old id.
+    let kept = commit.transform("a", at(2.0, 2.0), Some(25)).await.unwrap();
+    assert_eq!(kept, TransformOutcome::Kept);
+    commit.finish().await.unwrap();
+    let back = catalog
+        .commit_tile("v", &tile("a", 4, at(9.0, 9.0), 30))
+        .await
+        .unwrap();
+    assert_eq!(back, TileOutcome::New);
+    let back = catalog.tile("v", "a").await.unwrap().unwrap();
+    assert_eq!(
+        (back.id, back.section, back.transform),
+        (id, 4, at(2.0, 2.0))
+    );
+    assert_eq!(catalog.sections("v").await.unwrap(), [3, 4]);
+
+    // A tile that never came can be deleted as well; its id is nobody else's.
+    let noted = catalog.delete_tile("v", "never", 40).await.unwrap();
+    assert_eq!(noted, DeleteOutcome::Noted);
+    let late = catalog
+        .commit_tile("v", &tile("never", 0, at(0.0, 0.0), 39))
+        .await
+        .unwrap();
+    assert_eq!(late, TileOutcome::Superseded);
+    assert_eq!(catalog.entry("v").await.unwrap().tiles, 2);
+}
+
+fn broken(tile: &str) -> Quarantined {
+    Quarantined {
+        file: format!("{tile}.tif"),
+        tile: Some(tile.to_owned()),
+        reason: "it is damaged".to_owned(),
+        bytes: Some(12),
+        at: SystemTime::UNIX_EPOCH + Duration::from_millis(1_234_567),
+    }
+}
+
+#[tokio::test]
+async fn channels_stay_apart() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(folder.path()).await;
+    for channel in [0, 3] {
+        let tile = NewTile {
+            channel,
+            ..tile(&format!("c{channel}"), 1, at(0.0, 0.0), 1)
+        };
+        catalog.commit_tile("v", &tile).await.unwrap();
+    }
+    let tiles = catalog.section_tiles("v", 1).await.unwrap();
+    let channels: Vec<_> = tiles.iter().map(|t| (&*t.name, t.channel)).collect();
+    assert_eq!(channels, [("c0", 0), ("c3", 3)]);
+}
+
+#[tokio::test]
+async fn a_catalog_of_the_first_schema_is_brought_up() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("catalog.sqlite");
+    let first = include_str!("../migrations/sqlite/0001_first.sql");
+    sql(&path, first).await;
+    let description = serde_json::to_string(&volume("v")).unwrap();
+    sql(&path, &format!(
+        "INSERT INTO volumes VALUES (1, 'v', '{description}', 3, 3);
+         INSERT INTO tiles VALUES (1, 1, 'a', 2, 20, 10, 1, 0, 0, 1, 5, 6, 'tiles/a', 1, 0, 0),
+             (2, 1, 'b', 2, 20, 10, 1, 0, 0, 1, 0, 0, 'tiles/b', 2, 1, 1),
+             (3, 1, 'c', 4, 20, 10, 1, 0, 0, 1, 0, 0, 'tiles/c', 3, 2, 2);
+         INSERT INTO changes VALUES (1, 1, 1, 2, 5, 6, 25, 16, 'tile'),
+             (1, 2, 2, 2, 0, 0, 20, 10, 'tile'), (1, 3, 3, 4, 0, 0, 20, 10, 'transform');
+         CREATE TABLE _sqlx_migrations (version BIGINT PRIMARY KEY, description TEXT NOT NULL,
+             installed_on TIMESTAMP NOT NULL DEFAULT CURRENT_TIMESTAMP, success BOOLEAN NOT NULL,
+             checksum BLOB NOT NULL, execution_time BIGINT NOT NULL);
+         INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+             VALUES (1, 'first', true, x'{}', 1);",
+        // What the first version of the program noted of its file.
+        "25fd3d881f73b2437659234f8695fad1af353f2f9c6624435927b0b778da3c13e9c860a3023ac509ba99afd56c9cf64b"
+    )).await;
+    let catalog = Catalog::open(&path).await.unwrap();
+    assert_eq!(catalog.sections("v").await.unwrap(), [2, 4]);
+    let tiles = catalog.section_tiles("v", 2).await.unwrap();
+    let names: Vec<_> = tiles.iter().map(|t| (&*t.name, t.channel)).collect();
+    assert_eq!(names, [("a", 0), ("b", 0)]);
+    let reasons: Vec<_> = all_changes(&catalog)
+        .await
+        .iter()
+        .map(|c| c.reason)
+        .collect();
+    let (tile, transform) = (ChangeReason::Tile, ChangeReason::Transform);
+    assert_eq!(reasons, [tile, tile, transform]);
+    let deleted = catalog.delete_tile("v", "c", 9).await.unwrap();
+    assert_eq!(deleted, DeleteOutcome::Deleted);
+    assert_eq!(catalog.sections("v").await.unwrap(), [2]);
+    assert_eq!(catalog.statistics("v").await.unwrap().tiles, 2);
+}
+
+#[tokio::test]
 async fn a_replaced_pyramid_is_retired_not_forgotten() {
     let folder = tempfile::tempdir().unwrap();
     let catalog = catalog(folder.path()).await;
@@ -254,13 +396,7 @@ async fn a_commit_happens_whole_or_not_at_all() {
     let folder = tempfile::tempdir().unwrap();
     let catalog = catalog(folder.path()).await;
     let waiting = waiting("w", 1, at(0.0, 0.0), 5);
-    let broken = Quarantined {
-        file: "b.tif".to_owned(),
-        tile: Some("b".to_owned()),
-        reason: "it is damaged".to_owned(),
-        bytes: Some(12),
-        at: SystemTime::UNIX_EPOCH + Duration::from_millis(1_234_567),
-    };
+    let broken = broken("b");
     let cursor = Cursor {
         offset: 700,
         line: 9,
@@ -551,7 +687,7 @@ async fn a_newer_schema_is_refused() {
 }
 
 /// Does something to the file behind the catalog's back.
-async fn sql(path: &Path, statement: &'static str) {
+async fn sql(path: &Path, statements: &str) {
     use sqlx::Connection;
     let options = sqlx::sqlite::SqliteConnectOptions::new()
         .filename(path)
@@ -559,7 +695,7 @@ async fn sql(path: &Path, statement: &'static str) {
     let mut connection = sqlx::SqliteConnection::connect_with(&options)
         .await
         .unwrap();
-    sqlx::query(statement)
+    sqlx::raw_sql(sqlx::AssertSqlSafe(statements))
         .execute(&mut connection)
         .await
         .unwrap();
@@ -581,12 +717,15 @@ enum Said {
         x: i32,
         y: i32,
     },
+    Delete {
+        name: usize,
+    },
 }
 
 fn said() -> impl Strategy<Value = Said> {
     let place = || (0..80i32, 0..70i32);
     prop_oneof![
-        (
+        5 => (
             0..3usize,
             0..6u32,
             place(),
@@ -599,7 +738,8 @@ fn said() -> impl Strategy<Value = Said> {
                 y,
                 late
             }),
-        (0..3usize, place()).prop_map(|(name, (x, y))| Said::Move { name, x, y }),
+        4 => (0..3usize, place()).prop_map(|(name, (x, y))| Said::Move { name, x, y }),
+        2 => (0..3usize).prop_map(|name| Said::Delete { name }),
     ]
 }
 
@@ -634,6 +774,12 @@ async fn commit_one(
             let transform = at(x.into(), y.into());
             commit
                 .transform(&format!("t{name}"), transform, Some(record))
+                .await
+                .unwrap();
+        }
+        Said::Delete { name } => {
+            commit
+                .delete(&format!("t{name}"), record, SystemTime::now())
                 .await
                 .unwrap();
         }
@@ -685,6 +831,10 @@ fn model(stream: &[Said]) -> Tiles {
                         early.insert(name, transform);
                     }
                 }
+            }
+            Said::Delete { name } => {
+                tiles.remove(&format!("t{name}"));
+                early.remove(&format!("t{name}"));
             }
         }
     }

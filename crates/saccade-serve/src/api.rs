@@ -108,13 +108,14 @@ struct BoxDocument {
     max: [u32; 3],
 }
 
-/// Why voxels changed: a tile came, a tile moved, or events were missed and anything may have changed.
+/// Why voxels changed: a tile came, moved or was deleted, or events were missed and anything may have changed.
 #[derive(Debug, Serialize, ToSchema)]
 #[serde(rename_all = "kebab-case")]
 #[schema(as = ChangeReason)]
 enum ReasonDocument {
     Tile,
     Transform,
+    Deleted,
     Missed,
 }
 
@@ -130,6 +131,7 @@ impl From<Change> for ChangeDocument {
             reason: match change.reason {
                 ChangeReason::Tile => ReasonDocument::Tile,
                 ChangeReason::Transform => ReasonDocument::Transform,
+                ChangeReason::Deleted => ReasonDocument::Deleted,
                 // Whatever else there will be: the whole box is to be read again.
                 _ => ReasonDocument::Missed,
             },
@@ -176,6 +178,7 @@ mod tests {
         for reason in [
             ChangeReason::Tile,
             ChangeReason::Transform,
+            ChangeReason::Deleted,
             ChangeReason::Missed,
         ] {
             let change = Change {

@@ -143,6 +143,8 @@ pub enum ChangeReason {
     Tile,
     /// A tile moved.
     Transform,
+    /// A tile was deleted.
+    Deleted,
     /// Anything may have changed: events were missed.
     Missed,
 }

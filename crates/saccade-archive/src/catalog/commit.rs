@@ -1,5 +1,6 @@
 //! One transaction: everything in it happens, or nothing.
 
+use std::collections::BTreeMap;
 use std::time::SystemTime;
 
 use glam::UVec3;
@@ -34,6 +35,17 @@ pub enum TransformOutcome {
     Kept,
 }
 
+/// What became of a deletion.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum DeleteOutcome {
+    /// The volume has the tile no more, and its pyramid is retired.
+    Deleted,
+    /// There is a newer tile of that name, or it is deleted already: nothing changed.
+    Unchanged,
+    /// There is no such tile. Should one come whose record lies before, it stays out.
+    Noted,
+}
+
 /// A transaction on one volume. Dropped without [`finish`](Self::finish), it changes nothing.
 ///
 /// While it lives, other writers wait: keep it short.
@@ -46,13 +58,16 @@ pub struct Commit<'c> {
     extent: UVec3,
     before: u64,
     revision: u64,
-    new_tiles: i64,
+    /// Tiles that sections gain and lose.
+    sections: BTreeMap<u32, i64>,
 }
 
 /// What a commit needs to know of a tile that is there.
 struct Existing {
     id: TileId,
+    deleted: bool,
     section: u32,
+    /// `None` if it is outside, or deleted.
     place: Option<VoxelBox>,
     transform: SectionFromTile,
     size: glam::UVec2,
@@ -83,7 +98,7 @@ impl<'c> Commit<'c> {
             extent: entry.volume.extent(),
             before: entry.revision,
             revision: entry.revision,
-            new_tiles: 0,
+            sections: BTreeMap::new(),
         })
     }
 
@@ -105,8 +120,14 @@ impl<'c> Commit<'c> {
         {
             return Ok(TileOutcome::Superseded);
         }
+        let (known, deleted) = match existing {
+            Some(ref e) if e.deleted => (Some(e.id), Some(e.position)),
+            Some(ref e) => (Some(e.id), None),
+            None => (None, None),
+        };
+        let existing = existing.filter(|e| !e.deleted);
         let early = if existing.is_none() {
-            self.early(tile).await?
+            self.early(tile, deleted).await?
         } else {
             None
         };
@@ -119,18 +140,23 @@ impl<'c> Commit<'c> {
             _ => (tile.transform, tile.position),
         };
         let place = self.place(&tile.name, tile.section, tile.size, transform)?;
-        let id = match &existing {
-            Some(existing) => existing.id,
-            None => self.insert_name(tile).await?,
+        let id = match known {
+            Some(id) => id,
+            None => self.insert_name(&tile.name).await?,
         };
+        if let Some(existing) = &existing {
+            *self.sections.entry(existing.section).or_default() -= 1;
+        }
+        *self.sections.entry(tile.section).or_default() += 1;
         let old = existing.as_ref().and_then(|e| e.place);
         self.log_change(id, old, Some(place), ChangeReason::Tile)
             .await?;
-        let query = "UPDATE tiles SET section = ?, width = ?, height = ?, \
-                     a = ?, b = ?, c = ?, d = ?, tx = ?, ty = ?, \
+        let query = "UPDATE tiles SET deleted = 0, section = ?, channel = ?, \
+                     width = ?, height = ?, a = ?, b = ?, c = ?, d = ?, tx = ?, ty = ?, \
                      pyramid = ?, revision = ?, position = ?, transform_position = ? WHERE id = ?";
         let mut query = sqlx::query(query)
             .bind(tile.section)
+            .bind(tile.channel)
             .bind(tile.size.x)
             .bind(tile.size.y);
         for element in transform.elements() {
@@ -146,23 +172,12 @@ impl<'c> Commit<'c> {
             .execute(&mut *self.transaction)
             .await
             .map_err(|e| self.catalog.failed(e))?;
-        let query = sqlx::query("DELETE FROM quarantine WHERE volume = ? AND tile = ?");
-        let query = query.bind(self.volume).bind(&tile.name);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        self.end_quarantine(&tile.name).await?;
         let Some(existing) = existing else {
             return Ok(TileOutcome::New);
         };
         if existing.pyramid != tile.pyramid {
-            let query = "INSERT OR REPLACE INTO retired (pyramid, volume, at) VALUES (?, ?, ?)";
-            let query = sqlx::query(query).bind(existing.pyramid).bind(self.volume);
-            let query = query.bind(rows::millis(now));
-            query
-                .execute(&mut *self.transaction)
-                .await
-                .map_err(|e| self.catalog.failed(e))?;
+            self.retire(&existing.pyramid, now).await?;
         }
         Ok(TileOutcome::Replaced)
     }
@@ -182,7 +197,12 @@ impl<'c> Commit<'c> {
         transform: SectionFromTile,
         position: Option<u64>,
     ) -> Result<TransformOutcome, CatalogError> {
-        let Some(existing) = self.existing(tile).await? else {
+        let existing = self.existing(tile).await?;
+        let older = |e: &Existing| position.is_some_and(|p| p < e.position);
+        if existing.as_ref().is_some_and(|e| e.deleted && older(e)) {
+            return Ok(TransformOutcome::Unchanged);
+        }
+        let Some(existing) = existing.filter(|e| !e.deleted) else {
             self.keep_early(tile, transform, position.unwrap_or(0))
                 .await?;
             return Ok(TransformOutcome::Kept);
@@ -220,6 +240,79 @@ impl<'c> Commit<'c> {
         } else {
             TransformOutcome::Unchanged
         })
+    }
+
+    /// Deletes a tile, and what waits or is in quarantine under its name. Its pyramid is retired as of
+    /// `now`. A tile record that comes later but lies before `position` brings nothing back.
+    ///
+    /// # Errors
+    ///
+    /// What SQLite says.
+    pub async fn delete(
+        &mut self,
+        tile: &str,
+        position: u64,
+        now: SystemTime,
+    ) -> Result<DeleteOutcome, CatalogError> {
+        let existing = self.existing(tile).await?;
+        if existing.as_ref().is_some_and(|e| e.position > position) {
+            return Ok(DeleteOutcome::Unchanged);
+        }
+        let query = "DELETE FROM early_transforms WHERE volume = ? AND tile = ? AND position <= ?";
+        let query = sqlx::query(query).bind(self.volume).bind(tile);
+        query
+            .bind(rows::signed(position))
+            .execute(&mut *self.transaction)
+            .await
+            .map_err(|e| self.catalog.failed(e))?;
+        self.end_quarantine(tile).await?;
+        let (id, outcome) = match existing {
+            None => (self.insert_name(tile).await?, DeleteOutcome::Noted),
+            Some(e) if e.deleted => (e.id, DeleteOutcome::Unchanged),
+            Some(e) => {
+                self.log_change(e.id, e.place, None, ChangeReason::Deleted)
+                    .await?;
+                *self.sections.entry(e.section).or_default() -= 1;
+                self.retire(&e.pyramid, now).await?;
+                if e.transform_position > position {
+                    self.keep_early(tile, e.transform, e.transform_position)
+                        .await?;
+                }
+                (e.id, DeleteOutcome::Deleted)
+            }
+        };
+        let query = "UPDATE tiles SET deleted = 1, pyramid = '', position = ?, revision = ? \
+                     WHERE id = ?";
+        let query = sqlx::query(query)
+            .bind(rows::signed(position))
+            .bind(rows::signed(self.revision))
+            .bind(id.0);
+        query
+            .execute(&mut *self.transaction)
+            .await
+            .map_err(|e| self.catalog.failed(e))?;
+        Ok(outcome)
+    }
+
+    async fn end_quarantine(&mut self, tile: &str) -> Result<(), CatalogError> {
+        let query = sqlx::query("DELETE FROM quarantine WHERE volume = ? AND tile = ?");
+        let query = query.bind(self.volume).bind(tile);
+        query
+            .execute(&mut *self.transaction)
+            .await
+            .map_err(|e| self.catalog.failed(e))?;
+        Ok(())
+    }
+
+    async fn retire(&mut self, pyramid: &str, now: SystemTime) -> Result<(), CatalogError> {
+        let query = "INSERT OR REPLACE INTO retired (pyramid, volume, at) VALUES (?, ?, ?)";
+        let query = sqlx::query(query).bind(pyramid).bind(self.volume);
+        let query = query.bind(rows::millis(now));
+        query
+            .execute(&mut *self.transaction)
+            .await
+            .map_err(|e| self.catalog.failed(e))?;
+        Ok(())
     }
 
     /// Notes a file or record that could not become a tile.
@@ -319,12 +412,13 @@ impl<'c> Commit<'c> {
     ///
     /// What SQLite says; nothing has changed then.
     pub async fn finish(mut self) -> Result<u64, CatalogError> {
+        self.count_sections().await?;
         let changed = self.revision != self.before;
         if changed {
             let query = "UPDATE volumes SET revision = ?, tiles = tiles + ? WHERE id = ?";
             let query = sqlx::query(query)
                 .bind(rows::signed(self.revision))
-                .bind(self.new_tiles)
+                .bind(self.sections.values().sum::<i64>())
                 .bind(self.volume);
             query
                 .execute(&mut *self.transaction)
@@ -344,6 +438,36 @@ impl<'c> Commit<'c> {
         Ok(self.revision)
     }
 
+    async fn count_sections(&mut self) -> Result<(), CatalogError> {
+        for (section, more) in &self.sections {
+            let query = match more.signum() {
+                0 => continue,
+                1 => {
+                    "INSERT INTO sections (volume, section, tiles) VALUES (?1, ?2, ?3) \
+                     ON CONFLICT (volume, section) DO UPDATE SET tiles = sections.tiles + ?3"
+                }
+                _ => "UPDATE sections SET tiles = tiles + ?3 WHERE volume = ?1 AND section = ?2",
+            };
+            let query = sqlx::query(query)
+                .bind(self.volume)
+                .bind(section)
+                .bind(more);
+            query
+                .execute(&mut *self.transaction)
+                .await
+                .map_err(|e| self.catalog.failed(e))?;
+        }
+        if self.sections.values().any(|more| *more < 0) {
+            let query = "DELETE FROM sections WHERE volume = ? AND tiles = 0";
+            let query = sqlx::query(query).bind(self.volume);
+            query
+                .execute(&mut *self.transaction)
+                .await
+                .map_err(|e| self.catalog.failed(e))?;
+        }
+        Ok(())
+    }
+
     fn place(
         &self,
         tile: &str,
@@ -360,7 +484,7 @@ impl<'c> Commit<'c> {
     }
 
     async fn existing(&mut self, name: &str) -> Result<Option<Existing>, CatalogError> {
-        let query = "SELECT id, section, width, height, a, b, c, d, tx, ty, pyramid, position, \
+        let query = "SELECT id, deleted, section, width, height, a, b, c, d, tx, ty, pyramid, position, \
                      transform_position FROM tiles WHERE volume = ? AND name = ?";
         let query = sqlx::query(query).bind(self.volume).bind(name);
         let row = query.fetch_optional(&mut *self.transaction).await;
@@ -369,6 +493,7 @@ impl<'c> Commit<'c> {
         };
         let extent = self.extent;
         let decode = || {
+            let deleted: bool = row.try_get("deleted")?;
             let (section, size, transform) = (
                 rows::section(&row)?,
                 rows::size(&row)?,
@@ -376,8 +501,9 @@ impl<'c> Commit<'c> {
             );
             Ok(Existing {
                 id: TileId(row.try_get("id")?),
+                deleted,
                 section,
-                place: place(extent, section, size, transform),
+                place: place(extent, section, size, transform).filter(|_| !deleted),
                 transform,
                 size,
                 pyramid: row.try_get("pyramid")?,
@@ -389,13 +515,12 @@ impl<'c> Commit<'c> {
     }
 
     /// A row for a new tile; the caller fills in the rest.
-    async fn insert_name(&mut self, tile: &NewTile) -> Result<TileId, CatalogError> {
+    async fn insert_name(&mut self, tile: &str) -> Result<TileId, CatalogError> {
         let query = "INSERT INTO tiles (volume, name, section, width, height, a, b, c, d, tx, ty, \
                      pyramid, revision, position, transform_position) \
                      VALUES (?, ?, 0, 0, 0, 1, 0, 0, 1, 0, 0, '', 0, 0, 0)";
-        let query = sqlx::query(query).bind(self.volume).bind(&tile.name);
+        let query = sqlx::query(query).bind(self.volume).bind(tile);
         let done = query.execute(&mut *self.transaction).await;
-        self.new_tiles += 1;
         Ok(TileId(
             done.map_err(|e| self.catalog.failed(e))?
                 .last_insert_rowid(),
@@ -460,17 +585,21 @@ impl<'c> Commit<'c> {
         Ok(())
     }
 
-    /// Takes out the transform that came before a tile's first image, if it still counts.
+    /// Takes out the transform that came before a tile's first image, or the first since it was
+    /// `deleted`, if it still counts.
     async fn early(
         &mut self,
         tile: &NewTile,
+        deleted: Option<u64>,
     ) -> Result<Option<(SectionFromTile, u64)>, CatalogError> {
         let query = "DELETE FROM early_transforms WHERE volume = ?1 AND tile = ?2 \
                      RETURNING a, b, c, d, tx, ty, position, EXISTS (SELECT 1 FROM waiting \
                        WHERE waiting.volume = ?1 AND waiting.tile = ?2 \
-                         AND waiting.position < ?3) AS older_waits";
+                         AND waiting.position < ?3 AND waiting.position > ?4) AS older_waits";
         let query = sqlx::query(query).bind(self.volume).bind(&tile.name);
-        let query = query.bind(rows::signed(tile.position));
+        let query = query
+            .bind(rows::signed(tile.position))
+            .bind(deleted.map_or(-1, rows::signed));
         let row = query.fetch_optional(&mut *self.transaction).await;
         let Some(row) = row.map_err(|e| self.catalog.failed(e))? else {
             return Ok(None);

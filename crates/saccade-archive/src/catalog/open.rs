@@ -12,7 +12,7 @@ use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
 
-static MIGRATOR: Migrator = sqlx::migrate!();
+static MIGRATOR: Migrator = sqlx::migrate!("migrations/sqlite");
 
 /// "Sacc": marks the file as ours, whatever tables it has.
 const APPLICATION_ID: i64 = 0x5361_6363;
@@ -333,6 +333,7 @@ mod tests {
         NewTile {
             name: name.to_owned(),
             section: 0,
+            channel: 0,
             size: UVec2::splat(8),
             transform: SectionFromTile::translation(glam::DVec2::ZERO),
             pyramid: format!("tiles/{name}"),

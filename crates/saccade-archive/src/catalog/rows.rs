@@ -74,6 +74,7 @@ pub(super) fn tile(row: &SqliteRow) -> Result<Tile, Error> {
         id: TileId(row.try_get("id")?),
         name: row.try_get("name")?,
         section: section(row)?,
+        channel: small(row, "channel")?,
         size: size(row)?,
         transform: transform(row)?,
         pyramid: row.try_get("pyramid")?,
@@ -85,6 +86,7 @@ pub(super) fn reason(reason: ChangeReason) -> &'static str {
     match reason {
         ChangeReason::Tile => "tile",
         ChangeReason::Transform => "transform",
+        ChangeReason::Deleted => "deleted",
     }
 }
 
@@ -103,6 +105,7 @@ pub(super) fn change(row: &SqliteRow) -> Result<CatalogChange, Error> {
         voxels: VoxelBox::new(min, max),
         reason: match row.try_get("reason")? {
             "tile" => ChangeReason::Tile,
+            "deleted" => ChangeReason::Deleted,
             _ => ChangeReason::Transform,
         },
     })

@@ -141,6 +141,7 @@ impl Context<'_> {
         let tile = NewTile {
             name: record.tile,
             section,
+            channel: 0,
             size,
             transform,
             pyramid: name,

@@ -70,6 +70,7 @@ impl Inner {
             reason: match change.reason {
                 ChangeReason::Tile => crate::ChangeReason::Tile,
                 ChangeReason::Transform => crate::ChangeReason::Transform,
+                ChangeReason::Deleted => crate::ChangeReason::Deleted,
             },
         });
     }

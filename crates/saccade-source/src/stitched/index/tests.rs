@@ -13,6 +13,7 @@ fn tile(n: u32, size: UVec2, turn: f64, corner: DVec2) -> Tile {
         id: TileId(n.into()),
         name: format!("section0003_tile{n:06}"),
         section: 3,
+        channel: 0,
         size,
         transform: SectionFromTile::rotated(size.as_dvec2(), turn, corner),
         pyramid: format!("tiles/section0003/section0003_tile{n:06}-0123456789abcdef.tif"),
@@ -188,6 +189,7 @@ fn new_tile(name: &str, section: u32, corner: f64, position: u64) -> NewTile {
     NewTile {
         name: name.into(),
         section,
+        channel: 0,
         size: UVec2::new(300, 200),
         transform: SectionFromTile::rotated(DVec2::new(300.0, 200.0), 0.1, DVec2::splat(corner)),
         pyramid: format!("tiles/{name}-{position}.tif"),

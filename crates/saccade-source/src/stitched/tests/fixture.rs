@@ -74,6 +74,7 @@ impl Fixture {
         let new = NewTile {
             name: name.into(),
             section: tile.section,
+            channel: 0,
             size,
             transform: SectionFromTile::new(tile.transform).unwrap(),
             pyramid: pyramid.clone(),
