@@ -64,12 +64,7 @@ pub(crate) struct Microscope {
 
 impl Microscope {
     pub(crate) fn start(folder: &Path, extent: UVec3) -> Result<Self> {
-        AcquisitionInfo {
-            name: NAME.to_owned(),
-            extent,
-            voxel_nm: VOXEL_NM,
-        }
-        .write(folder)?;
+        AcquisitionInfo::new(NAME, extent, VOXEL_NM).write(folder)?;
         fs::create_dir_all(folder.join("tiles"))?;
         Ok(Self {
             folder: folder.to_owned(),
@@ -100,6 +95,7 @@ impl Microscope {
             section,
             size: UVec2::splat(edge),
             transform,
+            channel: None,
         };
         Ok(self.records.append(&Record::Tile(record))?)
     }

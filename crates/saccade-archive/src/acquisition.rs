@@ -24,12 +24,12 @@ use std::io;
 use std::path::{Component, Path, PathBuf};
 
 use glam::{DVec3, UVec3};
-use saccade_core::volume::{Volume, VolumeError};
+use saccade_core::volume::{Dtype, Volume, VolumeError};
 use serde::{Deserialize, Serialize};
 
 pub use record::{
-    BrokenRecord, Cursor, Record, RecordLine, RecordReader, RecordWriter, TileRecord,
-    TransformRecord,
+    BrokenRecord, ChannelRef, Cursor, DeleteRecord, Record, RecordLine, RecordReader, RecordWriter,
+    TileRecord, TransformRecord,
 };
 
 /// Why an acquisition archive, or a file that describes one, could not be used.
@@ -65,7 +65,8 @@ pub enum AcquisitionError {
     /// `volume.json` is not what it should be.
     #[error(
         "cannot understand {}; it should hold {{\"name\": .., \"extent\": [x, y, z], \
-         \"voxel_nm\": [x, y, z]}}",
+         \"voxel_nm\": [x, y, z]}}, and may hold \"dtype\" (\"uint8\" or \"uint16\"), \
+         \"channels\" (names) and \"kind\" (\"intensity\" or \"labels\")",
         path.display()
     )]
     Info {
@@ -135,11 +136,57 @@ pub struct AcquisitionInfo {
     pub extent: UVec3,
     /// Voxel size \[nm\].
     pub voxel_nm: DVec3,
+    /// Type of the voxels: `uint8`, also if it is not said, or `uint16`.
+    #[serde(default = "uint8", skip_serializing_if = "is_uint8")]
+    pub dtype: Dtype,
+    /// Names of the channels; none: one without a name.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub channels: Vec<String>,
+    /// What the voxels are.
+    #[serde(default, skip_serializing_if = "VoxelKind::is_intensity")]
+    pub kind: VoxelKind,
+}
+
+/// What voxels are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum VoxelKind {
+    /// Shades: coarser levels are averages.
+    #[default]
+    Intensity,
+    /// Numbers of objects: coarser levels show the most frequent.
+    Labels,
+}
+
+impl VoxelKind {
+    fn is_intensity(&self) -> bool {
+        *self == Self::Intensity
+    }
+}
+
+fn uint8() -> Dtype {
+    Dtype::Uint8
+}
+
+fn is_uint8(dtype: &Dtype) -> bool {
+    *dtype == Dtype::Uint8
 }
 
 impl AcquisitionInfo {
     /// The file's name in the archive.
     pub const FILE: &str = "volume.json";
+
+    /// A volume with one channel of 8-bit shades.
+    pub fn new(name: &str, extent: UVec3, voxel_nm: DVec3) -> Self {
+        Self {
+            name: name.to_owned(),
+            extent,
+            voxel_nm,
+            dtype: Dtype::Uint8,
+            channels: Vec::new(),
+            kind: VoxelKind::Intensity,
+        }
+    }
 
     /// Reads it from an acquisition archive.
     ///
@@ -186,7 +233,12 @@ impl AcquisitionInfo {
     ///
     /// [`VolumeError`] for an empty extent or an impossible voxel size.
     pub fn volume(&self) -> Result<Volume, VolumeError> {
-        Volume::new(&self.name, self.extent, self.voxel_nm)
+        let mut volume = Volume::new(&self.name, self.extent, self.voxel_nm)?;
+        volume.dtype = self.dtype;
+        if !self.channels.is_empty() {
+            volume.channels.clone_from(&self.channels);
+        }
+        Ok(volume)
     }
 }
 
@@ -241,11 +293,8 @@ mod tests {
     #[test]
     fn info_survives_its_file_and_more_fields() {
         let folder = tempfile::tempdir().unwrap();
-        let info = AcquisitionInfo {
-            name: "cortex".to_owned(),
-            extent: UVec3::new(10, 20, 3),
-            voxel_nm: DVec3::new(4.0, 4.0, 40.0),
-        };
+        let mut info =
+            AcquisitionInfo::new("cortex", UVec3::new(10, 20, 3), DVec3::new(4.0, 4.0, 40.0));
         info.write(&folder.path().join("new")).unwrap();
         assert_eq!(
             AcquisitionInfo::read(&folder.path().join("new")).unwrap(),
@@ -255,6 +304,22 @@ mod tests {
         let more = r#"{"name":"cortex","extent":[10,20,3],"voxel_nm":[4,4,40],"kV":1.5}"#;
         fs::write(folder.path().join(AcquisitionInfo::FILE), more).unwrap();
         assert_eq!(AcquisitionInfo::read(folder.path()).unwrap(), info);
+        assert_eq!(info.volume().unwrap().channels.len(), 1);
+
+        let more = r#"{"name":"cortex","extent":[10,20,3],"voxel_nm":[4,4,40],
+            "dtype":"uint16","channels":["SE","BSE"],"kind":"labels"}"#;
+        fs::write(folder.path().join(AcquisitionInfo::FILE), more).unwrap();
+        info.dtype = Dtype::Uint16;
+        info.channels = vec!["SE".to_owned(), "BSE".to_owned()];
+        info.kind = VoxelKind::Labels;
+        assert_eq!(AcquisitionInfo::read(folder.path()).unwrap(), info);
+        info.write(folder.path()).unwrap();
+        assert_eq!(AcquisitionInfo::read(folder.path()).unwrap(), info);
+        let volume = info.volume().unwrap();
+        assert_eq!(
+            (volume.dtype, volume.channels),
+            (Dtype::Uint16, info.channels)
+        );
     }
 
     #[test]

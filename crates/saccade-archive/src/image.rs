@@ -1,4 +1,4 @@
-//! Images as microscopes write them, decoded to 8-bit grey.
+//! Images as microscopes write them, decoded to grey of 8 or 16 bits.
 //!
 //! What counts is what an image shows, not how it is stored: palettes and colours whose channels are
 //! equal everywhere are grey, fewer bits are spread over the whole range, white-is-zero is turned
@@ -9,11 +9,18 @@
 //! aside with the reason. What cannot be told: uncompressed pixels of a file whose space was set
 //! aside before it was written are zeros like any others.
 //!
+//! A volume of 8 bits refuses images of 16: which of their values matter is not ours to guess. A volume of
+//! 16 bits spreads 8 over the whole range, exactly (times 257). Labels are numbers, not shades: none is
+//! spread, averaged or read out of a lossy file.
+//!
 //! Files may be hostile: no panic, and no more memory than a file of that many bytes can fill.
 
 use std::path::{Path, PathBuf};
 
+use saccade_core::volume::Dtype;
 use sniff::Kind;
+
+use crate::pyramid::Voxel;
 
 mod jpeg;
 mod png;
@@ -29,30 +36,103 @@ pub const MAX_EDGE: u32 = 1 << 19;
 /// Most pixels that an image is decoded to; four gigabytes.
 const MAX_PIXELS: u64 = 1 << 32;
 
-/// An 8-bit grey image.
+/// A grey image, or one of labels.
 #[derive(Clone, PartialEq, Eq)]
-pub struct GrayImage {
+pub struct Gray<T> {
     /// Pixels along x.
     pub width: u32,
     /// Pixels along y.
     pub height: u32,
     /// `width * height` values, x fastest. 0 is black.
-    pub voxels: Vec<u8>,
+    pub voxels: Vec<T>,
 }
 
-impl std::fmt::Debug for GrayImage {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "GrayImage({} x {})", self.width, self.height)
+/// An image of 8 bits.
+pub type GrayImage = Gray<u8>;
+
+/// An image of 16 bits.
+pub type GrayImage16 = Gray<u16>;
+
+/// An image of any of the types that volumes have.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Image {
+    /// 8 bits.
+    Uint8(GrayImage),
+    /// 16 bits.
+    Uint16(GrayImage16),
+}
+
+impl Image {
+    /// Width and height \[pixels\].
+    pub fn size(&self) -> [u32; 2] {
+        match self {
+            Self::Uint8(image) => [image.width, image.height],
+            Self::Uint16(image) => [image.width, image.height],
+        }
     }
 }
 
-impl GrayImage {
+/// What the values of an image are to become.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Wanted {
+    /// Type of the volume's voxels.
+    pub dtype: Dtype,
+    /// Whether they are labels, which are kept as they are.
+    pub labels: bool,
+}
+
+impl Wanted {
+    /// Grey of 8 bits.
+    pub const GRAY_8: Self = Self {
+        dtype: Dtype::Uint8,
+        labels: false,
+    };
+    /// Grey of 16 bits.
+    pub const GRAY_16: Self = Self {
+        dtype: Dtype::Uint16,
+        labels: false,
+    };
+
+    /// Refuses images of other bits than fit the volume.
+    fn check(self, bits: u32) -> Result<(), ImageError> {
+        if matches!(bits, 1 | 2 | 4 | 8) || (bits == 16 && self.dtype == Dtype::Uint16) {
+            Ok(())
+        } else {
+            Err(ImageError::Depth {
+                bits,
+                volume: 8 * u32::try_from(self.dtype.bytes()).unwrap_or(1),
+            })
+        }
+    }
+
+    /// An image of 8 bits as what is wanted.
+    fn of_8(self, image: GrayImage) -> Result<Image, ImageError> {
+        if self.dtype == Dtype::Uint8 {
+            return Ok(Image::Uint8(image));
+        }
+        let scale = if self.labels { 1 } else { 257 };
+        let mut voxels = allocate(image.voxels.len())?;
+        for (to, &from) in voxels.iter_mut().zip(&image.voxels) {
+            *to = u16::from(from) * scale;
+        }
+        Ok(Image::Uint16(Gray::new(image.width, image.height, voxels)))
+    }
+}
+
+impl<T> std::fmt::Debug for Gray<T> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let bits = 8 * size_of::<T>();
+        write!(f, "Gray({} x {} x {bits} bits)", self.width, self.height)
+    }
+}
+
+impl<T> Gray<T> {
     /// An image of these voxels.
     ///
     /// # Panics
     ///
     /// If there are not `width * height` of them.
-    pub fn new(width: u32, height: u32, voxels: Vec<u8>) -> Self {
+    pub fn new(width: u32, height: u32, voxels: Vec<T>) -> Self {
         let want = u64::from(width) * u64::from(height);
         assert_eq!(
             voxels.len() as u64,
@@ -83,11 +163,16 @@ pub enum ImageError {
         /// What is wrong.
         reason: String,
     },
-    /// More (or fewer) bits per sample than an 8-bit volume holds.
-    #[error("the image has {bits} bits per sample, but the volume has 8; convert it to 8 bit grey")]
+    /// More bits per sample than the volume holds, or an odd number of them.
+    #[error(
+        "the image has {bits} bits per sample, but the volume has {volume}; convert it to {volume} bit \
+         grey, or say another \"dtype\" in the volume.json of a new acquisition"
+    )]
     Depth {
         /// Bits of one sample.
         bits: u32,
+        /// Bits that the volume has.
+        volume: u32,
     },
     /// A pixel is not grey.
     #[error(
@@ -131,7 +216,7 @@ impl ImageError {
     }
 }
 
-/// Decodes a TIFF, PNG or JPEG file, told apart by its first bytes.
+/// Decodes a TIFF, PNG or JPEG file, told apart by its first bytes, to grey of 8 bits.
 ///
 /// Only the first image of a file is read; alpha is ignored.
 ///
@@ -139,24 +224,53 @@ impl ImageError {
 ///
 /// [`ImageError`].
 pub fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
+    of_8_bits(decode_as(bytes, Wanted::GRAY_8)?)
+}
+
+/// Decodes a TIFF, PNG or JPEG file to what is wanted.
+///
+/// # Errors
+///
+/// [`ImageError`].
+pub fn decode_as(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     match sniff::kind(bytes)? {
-        Kind::Tiff => tiff::decode(bytes),
-        Kind::Png => png::decode(bytes),
-        Kind::Jpeg => jpeg::decode(bytes),
+        Kind::Tiff => tiff::decode(bytes, wanted),
+        Kind::Png => png::decode(bytes, wanted),
+        Kind::Jpeg => jpeg::decode(bytes, wanted),
     }
 }
 
-/// Reads and decodes a file.
+/// Reads and decodes a file to grey of 8 bits.
 ///
 /// # Errors
 ///
 /// [`ImageError`].
 pub fn decode_file(path: &Path) -> Result<GrayImage, ImageError> {
+    of_8_bits(decode_file_as(path, Wanted::GRAY_8)?)
+}
+
+/// Reads and decodes a file to what is wanted.
+///
+/// # Errors
+///
+/// [`ImageError`].
+pub fn decode_file_as(path: &Path, wanted: Wanted) -> Result<Image, ImageError> {
     let read = std::fs::read(path);
-    decode(&read.map_err(|source| ImageError::Read {
+    let bytes = read.map_err(|source| ImageError::Read {
         source,
         path: path.to_owned(),
-    })?)
+    })?;
+    decode_as(&bytes, wanted)
+}
+
+fn of_8_bits(image: Image) -> Result<GrayImage, ImageError> {
+    match image {
+        Image::Uint8(image) => Ok(image),
+        Image::Uint16(_) => Err(ImageError::Depth {
+            bits: 16,
+            volume: 8,
+        }),
+    }
 }
 
 /// The number of pixels, if it is one that a tile can have.
@@ -169,11 +283,12 @@ fn check_size(width: u32, height: u32) -> Result<usize, ImageError> {
 }
 
 /// Zeros, or an error where memory does not suffice.
-fn allocate(len: usize) -> Result<Vec<u8>, ImageError> {
+fn allocate<T: Voxel>(len: usize) -> Result<Vec<T>, ImageError> {
     let mut voxels = Vec::new();
     let reserved = voxels.try_reserve_exact(len);
-    reserved.map_err(|_| ImageError::Memory { bytes: len })?;
-    voxels.resize(len, 0);
+    let bytes = len.saturating_mul(T::DTYPE.bytes());
+    reserved.map_err(|_| ImageError::Memory { bytes })?;
+    voxels.resize(len, T::default());
     Ok(voxels)
 }
 
@@ -186,35 +301,37 @@ const LOSSY: u8 = 24;
 
 /// Grey values of an image's interleaved ones, in place: of the first channel, or of three that are
 /// `apart` at most, and of any others nothing.
-fn gray(
+fn gray<T: Voxel>(
     (width, height): (u32, u32),
-    mut samples: Vec<u8>,
+    mut samples: Vec<T>,
     channels: usize,
     apart: u8,
-) -> Result<GrayImage, ImageError> {
+) -> Result<Gray<T>, ImageError> {
     let pixels = samples.len() / channels;
+    // One shade of eight bits is so many of these.
+    let shade = if T::DTYPE == Dtype::Uint8 { 1 } else { 257 };
     if channels == 2 {
         for pixel in 0..pixels {
             samples[pixel] = samples[2 * pixel];
         }
     } else if channels > 2 {
         for pixel in 0..pixels {
-            let rgb = [0, 1, 2].map(|c| samples[channels * pixel + c]);
+            let rgb = [0, 1, 2].map(|c| u32::from(samples[channels * pixel + c].value()));
             let [r, g, b] = rgb;
-            if r.max(g).max(b) - r.min(g).min(b) > apart {
+            if r.max(g).max(b) - r.min(g).min(b) > shade * u32::from(apart) {
                 // Both are less than the image's edges.
                 let place = |at: usize| u32::try_from(at).unwrap_or(u32::MAX);
                 let (x, y) = (pixel % width as usize, pixel / width as usize);
                 let (x, y) = (place(x), place(y));
+                let rgb = rgb.map(|v| u8::try_from(v / shade).unwrap_or(u8::MAX));
                 return Err(ImageError::Color { x, y, rgb });
             }
-            // Rec. 601, in thousandths that add up to one: white stays 255.
-            let [r, g, b] = rgb.map(u32::from);
+            // Rec. 601, in thousandths that add up to one: white stays white.
             let luma = (299 * r + 587 * g + 114 * b + 500) / 1000;
-            samples[pixel] = u8::try_from(luma).unwrap_or(u8::MAX);
+            samples[pixel] = T::from_wide(luma.into());
         }
     }
     samples.truncate(pixels);
     samples.shrink_to_fit();
-    Ok(GrayImage::new(width, height, samples))
+    Ok(Gray::new(width, height, samples))
 }

@@ -3,10 +3,15 @@
 //! [`encode`] makes a file's bytes from an image, [`PyramidIndex::open`] reads what is where in it,
 //! [`PyramidIndex::decode_sub_tile`] gives voxels back. Nothing else knows the file's layout.
 //!
+//! # Voxels
+//!
+//! `u8` or `u16`: a pyramid has the type of its image. JPEG holds 8 bits only.
+//!
 //! # Levels
 //!
 //! Level k has `ceil(w / 2^k)` by `ceil(h / 2^k)` pixels, down to one sub-tile. A pixel is the mean
-//! of the level-0 pixels it covers that exist, rounded half up once: not the mean of rounded means.
+//! of the level-0 pixels it covers that exist, rounded half up once: not the mean of rounded means. Of labels
+//! ([`encode_labels`]) it is the one that most of these pixels have.
 //!
 //! # Sub-tiles
 //!
@@ -26,17 +31,21 @@ use glam::UVec2;
 mod codec;
 mod encode;
 mod error;
+mod filter;
 mod index;
 mod layout;
 mod mean;
+mod mode;
 mod morton;
 mod parse;
 #[cfg(test)]
 mod tests;
+mod voxel;
 
-pub use encode::encode;
+pub use encode::{encode, encode_labels};
 pub use error::{EncodeError, PyramidError};
 pub use index::{PyramidIndex, SubTileRead};
+pub use voxel::Voxel;
 
 /// Edge of a sub-tile \[pixels\].
 pub const SUB_TILE_EDGE: u32 = 128;
@@ -46,7 +55,7 @@ pub const SUB_TILE_VOXELS: usize = (SUB_TILE_EDGE * SUB_TILE_EDGE) as usize;
 /// How sub-tiles are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Encoding {
-    /// JPEG of this quality, 1 to 100.
+    /// JPEG of this quality, 1 to 100. Of 8 bits only.
     Jpeg {
         /// As libjpeg counts it. EM at 75 takes 2 to 2.5 bits per pixel, at 50 less than 2.
         quality: u8,
@@ -95,11 +104,11 @@ pub struct SubTileEntry {
     /// Bytes; 0 if blank.
     pub len: u32,
     /// Smallest value.
-    pub min: u8,
+    pub min: u16,
     /// Largest value.
-    pub max: u8,
+    pub max: u16,
     /// Mean value, rounded.
-    pub mean: u8,
+    pub mean: u16,
 }
 
 impl SubTileEntry {

@@ -459,6 +459,7 @@ fn waiting(tile: &str, section: u32, transform: SectionFromTile, position: u64) 
         section,
         size: SIZE,
         transform,
+        channel: None,
     };
     Waiting {
         position,

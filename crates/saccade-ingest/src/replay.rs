@@ -190,6 +190,7 @@ pub fn run(
             section: tile.section,
             size: tile.size,
             transform: tile.stage,
+            channel: None,
         }))?;
         summary.tiles += 1;
         summary.pixels += pixels;
@@ -247,11 +248,7 @@ fn described(
     let name = config.name.as_ref().unwrap_or(&acquisition.name);
     check_name(name)?;
     crate::simulate::check_rate_and_voxel(config.rate_mpixel_s, config.voxel_nm)?;
-    let info = AcquisitionInfo {
-        name: name.clone(),
-        extent: acquisition.extent,
-        voxel_nm: config.voxel_nm,
-    };
+    let info = AcquisitionInfo::new(name, acquisition.extent, config.voxel_nm);
     Ok((info, Settings::of_replay(&acquisition.identity())))
 }
 

@@ -353,6 +353,7 @@ impl Run<'_> {
             section,
             size,
             transform,
+            channel: None,
         };
         self.archive.records.append(&Record::Tile(record))?;
         self.summary.tiles += 1;

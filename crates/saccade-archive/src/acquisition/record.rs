@@ -21,6 +21,18 @@ pub enum Record {
     Tile(TileRecord),
     /// A tile lies elsewhere than said before. May come before its tile.
     Transform(TransformRecord),
+    /// A tile is no more. One of the same name that comes later is another.
+    Delete(DeleteRecord),
+}
+
+/// Which channel of the volume a tile shows: its place in the list, or its name in it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum ChannelRef {
+    /// Place in the list, from 0.
+    Index(u32),
+    /// Name.
+    Name(String),
 }
 
 /// A tile was acquired.
@@ -36,6 +48,29 @@ pub struct TileRecord {
     pub size: UVec2,
     /// Where the stage says it lies: to level-0 voxels from pixels.
     pub transform: SectionFromTile,
+    /// The channel; the volume's first if it is not said.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub channel: Option<ChannelRef>,
+}
+
+impl TileRecord {
+    /// The place of its channel among the volume's; `None` if there is no such channel.
+    pub fn channel_among(&self, channels: &[String]) -> Option<u32> {
+        let index = match &self.channel {
+            None => Some(0),
+            Some(ChannelRef::Index(index)) => usize::try_from(*index).ok(),
+            Some(ChannelRef::Name(name)) => channels.iter().position(|c| c == name),
+        };
+        let index = index.filter(|&index| index < channels.len())?;
+        u32::try_from(index).ok()
+    }
+}
+
+/// A tile is no more.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DeleteRecord {
+    /// The tile's name.
+    pub tile: String,
 }
 
 /// A tile's transform changed.
@@ -279,6 +314,7 @@ mod tests {
             section: 3,
             size: UVec2::new(300, 260),
             transform: SectionFromTile::translation(DVec2::new(10.0, -2.5)),
+            channel: None,
         })
     }
 
@@ -296,6 +332,33 @@ mod tests {
             panic!("not a transform")
         };
         assert_eq!(moved.transform.elements(), [1.0, 0.0, 0.0, 1.0, 2.0, 3.0]);
+    }
+
+    #[test]
+    fn channels_are_named_or_counted() {
+        let channels = ["membranes", "2"].map(str::to_owned);
+        let of = |channel: &str| {
+            let text = format!(
+                r#"{{"tile":"a","file":"a","section":0,"size":[1,1],"transform":[1,0,0,1,0,0]{channel}}}"#
+            );
+            let record: TileRecord = serde_json::from_str(&text).unwrap();
+            let again = serde_json::to_string(&record).unwrap();
+            assert_eq!(serde_json::from_str::<TileRecord>(&again).unwrap(), record);
+            record.channel_among(&channels)
+        };
+        assert_eq!(of(""), Some(0));
+        assert_eq!(of(r#","channel":1"#), Some(1));
+        assert_eq!(of(r#","channel":"membranes""#), Some(0));
+        // A number in quotes is a name.
+        assert_eq!(of(r#","channel":"2""#), Some(1));
+        assert_eq!(of(r#","channel":2"#), None);
+        assert_eq!(of(r#","channel":"gold""#), None);
+        let deleted = r#"{"record":"delete","tile":"a"}"#;
+        let tile = "a".to_owned();
+        assert_eq!(
+            serde_json::from_str::<Record>(deleted).unwrap(),
+            Record::Delete(DeleteRecord { tile })
+        );
     }
 
     #[test]

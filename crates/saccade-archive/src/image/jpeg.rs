@@ -3,15 +3,21 @@
 use turbojpeg::{Colorspace, Decompressor, Image, PixelFormat};
 
 use super::sniff::{broken, check_jpeg};
-use super::{GrayImage, ImageError, LOSSY, allocate, check_size, gray};
+use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, check_size, gray};
 
 /// Progressive files may refine the image as often as they like; this many times are enough.
 const MAX_SCANS: u32 = 500;
 
-pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
+pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Decoded, ImageError> {
     let bits = check_jpeg(bytes)?;
+    if wanted.labels {
+        return Err(ImageError::Unsupported {
+            what: "labels in a JPEG, which keeps numbers only roughly".to_owned(),
+        });
+    }
     if bits != 8 {
-        return Err(ImageError::Depth { bits });
+        let volume = 8 * u32::try_from(wanted.dtype.bytes()).unwrap_or(1);
+        return Err(ImageError::Depth { bits, volume });
     }
     let mut decoder = Decompressor::new().map_err(broken)?;
     decoder.set_scan_limit(MAX_SCANS).map_err(broken)?;
@@ -46,5 +52,5 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
         format,
     };
     decoder.decompress(bytes, image).map_err(broken)?;
-    gray((width, height), voxels, channels, LOSSY)
+    wanted.of_8(gray((width, height), voxels, channels, LOSSY)?)
 }

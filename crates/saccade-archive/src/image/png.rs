@@ -1,26 +1,35 @@
-//! PNG files of 8 bits per sample or less.
+//! PNG files of up to 16 bits per sample.
 
 use std::io::{self, Cursor};
 
 use png::{BitDepth, ColorType, Decoder, DecodingError, Transformations};
 
 use super::sniff::{broken, check_png, incomplete};
-use super::{EXACT, GrayImage, ImageError, allocate, check_size, gray};
+use super::tiff::unpack;
+use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, check_size, gray};
 
-pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
+pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     check_png(bytes)?;
     let mut decoder = Decoder::new(Cursor::new(bytes));
-    // Palettes become colours, fewer bits become eight.
-    decoder.set_transformations(Transformations::EXPAND);
+    // Palettes become colours, fewer bits become eight; labels stay the numbers that they are.
+    decoder.set_transformations(if wanted.labels {
+        Transformations::IDENTITY
+    } else {
+        Transformations::EXPAND
+    });
     let mut reader = decoder.read_info().map_err(sort)?;
     let (width, height) = (reader.info().width, reader.info().height);
     let pixels = check_size(width, height)?;
     let (color, depth) = reader.output_color_type();
-    if depth != BitDepth::Eight {
-        return Err(ImageError::Depth { bits: depth as u32 });
-    }
+    let bits = depth as usize;
+    wanted.check(depth as u32)?;
     let channels = match color {
         ColorType::Grayscale => 1,
+        ColorType::Indexed if wanted.labels => 1,
+        _ if wanted.labels => {
+            let what = "labels in several channels".to_owned();
+            return Err(ImageError::Unsupported { what });
+        }
         ColorType::GrayscaleAlpha => 2,
         ColorType::Rgb => 3,
         ColorType::Rgba => 4,
@@ -28,16 +37,35 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
     };
     /// Deflate's bound is 1032.
     const MAX_RATIO: usize = 2048;
-    let len = pixels * channels;
+    // Rows begin on whole bytes.
+    let row = (width as usize * channels * bits).div_ceil(8);
+    let len = row * height as usize;
     if reader.output_buffer_size() != Some(len) || len / MAX_RATIO > bytes.len() {
         return Err(broken(format!(
             "{} bytes cannot hold {pixels} pixels",
             bytes.len()
         )));
     }
-    let mut voxels = allocate(len)?;
+    if depth == BitDepth::Sixteen {
+        let mut samples = allocate::<u16>(pixels * channels)?;
+        reader
+            .next_frame(bytemuck::cast_slice_mut(&mut samples))
+            .map_err(sort)?;
+        for sample in &mut samples {
+            *sample = u16::from_be(*sample);
+        }
+        let image = gray((width, height), samples, channels, EXACT)?;
+        return Ok(Image::Uint16(image));
+    }
+    let mut voxels = allocate::<u8>(len)?;
     reader.next_frame(&mut voxels).map_err(sort)?;
-    gray((width, height), voxels, channels, EXACT)
+    if bits < 8 {
+        // Only labels come as few bits.
+        let mut labels = allocate::<u8>(pixels)?;
+        unpack(&voxels, row, width as usize, bits, 1, &mut labels);
+        return wanted.of_8(Gray::new(width, height, labels));
+    }
+    wanted.of_8(gray((width, height), voxels, channels, EXACT)?)
 }
 
 fn sort(e: DecodingError) -> ImageError {

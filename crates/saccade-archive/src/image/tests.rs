@@ -10,7 +10,7 @@ use ::png::{BitDepth, ColorType, Encoder};
 use ::tiff::encoder::{Compression, DeflateLevel, Predictor, TiffEncoder, colortype};
 use proptest::prelude::*;
 
-use super::{GrayImage, ImageError, decode, decode_file, sniff};
+use super::{GrayImage, Image, ImageError, Wanted, decode, decode_as, decode_file, sniff};
 
 /// Texture with odd sides: neighbours differ, yet it compresses.
 fn texture(width: u32, height: u32) -> GrayImage {
@@ -237,10 +237,92 @@ fn sixteen_bits_are_refused() {
     let png = png_file(30, 20, ColorType::Grayscale, BitDepth::Sixteen, &bytes);
     for file in [file.into_inner(), png] {
         let error = decode(&file).unwrap_err();
-        assert!(matches!(error, ImageError::Depth { bits: 16 }), "{error:?}");
+        assert!(
+            matches!(
+                error,
+                ImageError::Depth {
+                    bits: 16,
+                    volume: 8
+                }
+            ),
+            "{error:?}"
+        );
         assert!(error.to_string().contains("convert it to 8 bit"), "{error}");
         assert!(!error.is_transient());
     }
+}
+
+/// In a volume of 16 bits: as they are, and of 8 bits spread over the whole range.
+#[test]
+fn sixteen_bits_come_back_where_there_is_room() {
+    let pixels: Vec<u16> = (0..31 * 20).map(|i| i * 105).collect();
+    let tiff = |pixels: &[u16]| {
+        let mut file = Cursor::new(Vec::new());
+        let mut encoder = TiffEncoder::new(&mut file).unwrap();
+        let mut strips = encoder.new_image::<colortype::Gray16>(31, 20).unwrap();
+        strips.rows_per_strip(3).unwrap();
+        strips.write_data(pixels).unwrap();
+        file.into_inner()
+    };
+    let bytes: Vec<u8> = pixels.iter().flat_map(|p| p.to_be_bytes()).collect();
+    let png = png_file(31, 20, ColorType::Grayscale, BitDepth::Sixteen, &bytes);
+    let rgb: Vec<u8> = pixels
+        .iter()
+        .flat_map(|p| [p.to_be_bytes(); 3].concat())
+        .collect();
+    let rgb = png_file(31, 20, ColorType::Rgb, BitDepth::Sixteen, &rgb);
+    let labels = Wanted {
+        labels: true,
+        ..Wanted::GRAY_16
+    };
+    for file in [tiff(&pixels), png, rgb.clone()] {
+        let Image::Uint16(seen) = decode_as(&file, Wanted::GRAY_16).unwrap() else {
+            panic!("16 bit")
+        };
+        assert!((seen.width, seen.height) == (31, 20) && seen.voxels == pixels);
+        let several = file == rgb;
+        let seen = decode_as(&file, labels);
+        assert!(
+            seen.is_ok_and(|image| matches!(image, Image::Uint16(i) if i.voxels == pixels))
+                != several
+        );
+    }
+    let image = texture(31, 20);
+    let of_8 = |wanted| match decode_as(&gray_png(&image), wanted).unwrap() {
+        Image::Uint16(seen) => seen.voxels,
+        Image::Uint8(_) => panic!("16 bit"),
+    };
+    let spread: Vec<u16> = image.voxels.iter().map(|&v| u16::from(v) * 257).collect();
+    assert_eq!(of_8(Wanted::GRAY_16), spread);
+    let kept: Vec<u16> = image.voxels.iter().map(|&v| v.into()).collect();
+    assert_eq!(of_8(labels), kept);
+}
+
+/// Labels are numbers: indices of a palette, and few bits, come as they are; roughly is not enough.
+#[test]
+fn labels_are_not_shades() {
+    let labels = Wanted {
+        labels: true,
+        ..Wanted::GRAY_8
+    };
+    let seen = |file: &[u8]| match decode_as(file, labels).unwrap() {
+        Image::Uint8(seen) => seen.voxels,
+        Image::Uint16(_) => panic!("8 bit"),
+    };
+    let bits = png_file(
+        5,
+        2,
+        ColorType::Grayscale,
+        BitDepth::Two,
+        &[0b0110_1100, 0b0100_0000, 0xff, 0],
+    );
+    assert_eq!(seen(&bits), [1, 2, 3, 0, 1, 3, 3, 3, 3, 0]);
+    let colours = [9, 200, 3, 77, 0, 128, 255, 255, 1];
+    assert_eq!(seen(&palette_png(3, 1, &colours, &[2, 0, 1])), [2, 0, 1]);
+    let four = raw_tiff([4, 1], 4, &[(PHOTOMETRIC, 1)], &[0x3a, 0x0f]);
+    assert_eq!(seen(&four), [3, 10, 0, 15]);
+    let rough = decode_as(&jpeg_file(&texture(16, 16), false), labels).unwrap_err();
+    assert!(rough.to_string().contains("labels in a JPEG"), "{rough}");
 }
 
 /// Pixels of an image as so many equal channels, and alpha after three.
@@ -476,13 +558,25 @@ fn what_would_be_read_wrongly_is_refused() {
         assert!(said.contains(word) && said.contains("convert it"), "{said}");
     }
     let few = decode(&raw_tiff([2, 2], 6, &[(PHOTOMETRIC, 1)], &pixels)).unwrap_err();
-    assert!(matches!(few, ImageError::Depth { bits: 6 }), "{few:?}");
+    assert!(
+        matches!(few, ImageError::Depth { bits: 6, volume: 8 }),
+        "{few:?}"
+    );
 
     let mut twelve = jpeg_file(&texture(16, 16), false);
     let frame = twelve.windows(2).position(|w| w == [0xff, 0xc0]).unwrap();
     assert_eq!(std::mem::replace(&mut twelve[frame + 4], 12), 8);
     let error = decode(&twelve).unwrap_err();
-    assert!(matches!(error, ImageError::Depth { bits: 12 }), "{error:?}");
+    assert!(
+        matches!(
+            error,
+            ImageError::Depth {
+                bits: 12,
+                volume: 8
+            }
+        ),
+        "{error:?}"
+    );
 }
 
 /// Claims of gigapixels in a few bytes are refused before memory is set aside.

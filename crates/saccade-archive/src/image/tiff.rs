@@ -9,9 +9,9 @@ use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
 
 use super::sniff::{broken, incomplete};
-use super::{EXACT, GrayImage, ImageError, allocate, check_size, gray};
+use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, check_size, gray};
 
-pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
+pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     check_header(bytes)?;
     let mut limits = Limits::default();
     // What a file holds is no longer than the file; the image is given its memory below.
@@ -25,21 +25,28 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
     let pixels = check_size(width, height)?;
     check_samples(&mut decoder)?;
     let (channels, bits) = match decoder.colortype().map_err(sort)? {
-        ColorType::Gray(bits @ (1 | 2 | 4 | 8)) => (1, bits),
-        ColorType::RGB(8) => (3, 8),
-        ColorType::RGBA(8) => (4, 8),
+        ColorType::Gray(bits @ (1 | 2 | 4 | 8 | 16)) => (1, bits),
+        ColorType::RGB(bits @ (8 | 16)) => (3, bits),
+        ColorType::RGBA(bits @ (8 | 16)) => (4, bits),
         ColorType::Gray(bits)
         | ColorType::RGB(bits)
         | ColorType::RGBA(bits)
         | ColorType::Multiband {
             bit_depth: bits @ 9..,
             ..
-        } => return Err(ImageError::Depth { bits: bits.into() }),
+        } => {
+            wanted.check(bits.into())?;
+            return Err(unsupported(format!("a TIFF of {bits} bits per sample")));
+        }
         ColorType::Multiband { num_samples, .. } => {
             return Err(unsupported(format!("a TIFF of {num_samples} channels")));
         }
         other => return Err(unsupported(format!("TIFF colours {other:?}"))),
     };
+    wanted.check(bits.into())?;
+    if wanted.labels && channels > 1 {
+        return Err(unsupported("labels in several channels"));
+    }
     check_data(&mut decoder, bytes.len() as u64)?;
     let layout = decoder.image_buffer_layout().map_err(sort)?;
     // Rows begin on whole bytes.
@@ -48,26 +55,49 @@ pub(super) fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
         return Err(unsupported("a TIFF of several planes"));
     }
     check_ratio(bytes.len(), layout.len)?;
-    let mut samples = allocate(layout.len)?;
+    if bits == 16 {
+        let mut samples = allocate::<u16>(layout.len / 2)?;
+        // In this machine's order of bytes.
+        decoder
+            .read_image_bytes(bytemuck::cast_slice_mut(&mut samples))
+            .map_err(sort)?;
+        let image = gray((width, height), samples, channels, EXACT)?;
+        return Ok(Image::Uint16(image));
+    }
+    let mut samples = allocate::<u8>(layout.len)?;
     decoder.read_image_bytes(&mut samples).map_err(sort)?;
     if bits < 8 {
-        let voxels = spread(&samples, row, width as usize, bits, allocate(pixels)?);
-        return Ok(GrayImage::new(width, height, voxels));
+        let bits = usize::from(bits);
+        // Spread over 0 to 255, exactly; labels stay the numbers that they are.
+        let scale = if wanted.labels {
+            1
+        } else {
+            u8::MAX / (u8::MAX >> (8 - bits))
+        };
+        let mut voxels = allocate::<u8>(pixels)?;
+        unpack(&samples, row, width as usize, bits, scale, &mut voxels);
+        return wanted.of_8(Gray::new(width, height, voxels));
     }
-    gray((width, height), samples, channels, EXACT)
+    wanted.of_8(gray((width, height), samples, channels, EXACT)?)
 }
 
-/// Samples of 1, 2 or 4 bits, the first in the highest bits, spread over 0 to 255, exactly.
-fn spread(packed: &[u8], row: usize, width: usize, bits: u8, mut voxels: Vec<u8>) -> Vec<u8> {
-    let per_byte = usize::from(8 / bits);
+/// Samples of 1, 2 or 4 bits, the first in the highest bits, times `scale`.
+pub(super) fn unpack(
+    packed: &[u8],
+    row: usize,
+    width: usize,
+    bits: usize,
+    scale: u8,
+    to: &mut [u8],
+) {
+    let per_byte = 8 / bits;
     let most = u8::MAX >> (8 - bits);
-    for (packed, voxels) in packed.chunks_exact(row).zip(voxels.chunks_exact_mut(width)) {
-        for (x, voxel) in voxels.iter_mut().enumerate() {
-            let shift = (per_byte - 1 - x % per_byte) * usize::from(bits);
-            *voxel = ((packed[x / per_byte] >> shift) & most) * (u8::MAX / most);
+    for (packed, to) in packed.chunks_exact(row).zip(to.chunks_exact_mut(width)) {
+        for (x, voxel) in to.iter_mut().enumerate() {
+            let shift = (per_byte - 1 - x % per_byte) * bits;
+            *voxel = ((packed[x / per_byte] >> shift) & most) * scale;
         }
     }
-    voxels
 }
 
 /// Refuses what the decoder below would read as something else than it is, or not explain.

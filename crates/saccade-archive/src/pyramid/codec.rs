@@ -5,6 +5,9 @@ use std::cell::RefCell;
 use flate2::{Compress, Compression, Decompress, FlushCompress, FlushDecompress, Status};
 use turbojpeg::{Compressor, Decompressor, Image, PixelFormat, Subsamp};
 
+use saccade_core::volume::Dtype;
+
+use super::voxel::pixel::Pixel;
 use super::{EncodeError, Encoding, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 
 const EDGE: usize = SUB_TILE_EDGE as usize;
@@ -71,8 +74,9 @@ pub(super) enum Encoder {
 }
 
 impl Encoder {
-    pub(super) fn new(encoding: &Encoding) -> Result<Self, EncodeError> {
+    pub(super) fn new(encoding: &Encoding, dtype: Dtype) -> Result<Self, EncodeError> {
         match *encoding {
+            Encoding::Jpeg { .. } if dtype != Dtype::Uint8 => Err(EncodeError::JpegDepth),
             Encoding::Jpeg { quality } => {
                 let failed = |source| EncodeError::Jpeg { source };
                 let mut compressor = Compressor::new().map_err(failed)?;
@@ -91,7 +95,7 @@ impl Encoder {
             }
             Encoding::Lossless => Ok(Self::Lossless {
                 compressor: Compress::new(Compression::fast(), true),
-                differences: vec![0; SUB_TILE_VOXELS],
+                differences: vec![0; SUB_TILE_VOXELS * dtype.bytes()],
             }),
         }
     }
@@ -105,16 +109,16 @@ impl Encoder {
     }
 
     /// The bytes of a blank sub-tile.
-    pub(super) fn blank(&mut self) -> Result<Vec<u8>, EncodeError> {
+    pub(super) fn blank<T: Pixel>(&mut self) -> Result<Vec<u8>, EncodeError> {
         let mut blank = Vec::new();
-        self.encode(&[0; SUB_TILE_VOXELS], EDGE, &mut blank)?;
+        self.encode(&[T::default(); SUB_TILE_VOXELS], EDGE, &mut blank)?;
         Ok(blank)
     }
 
     /// Appends a sub-tile's bytes to `to`. Its rows are `pitch` voxels apart.
-    pub(super) fn encode(
+    pub(super) fn encode<T: Pixel>(
         &mut self,
-        voxels: &[u8],
+        voxels: &[T],
         pitch: usize,
         to: &mut Vec<u8>,
     ) -> Result<(), EncodeError> {
@@ -124,6 +128,7 @@ impl Encoder {
                 headers,
                 stream,
             } => {
+                let voxels = T::bytes(voxels).ok_or(EncodeError::JpegDepth)?;
                 let written = compressor.compress_to_slice(image(voxels, pitch), stream);
                 let written = written.map_err(|source| EncodeError::Jpeg { source })?;
                 let data = stream[..written].strip_prefix(&*headers.full);
@@ -134,15 +139,13 @@ impl Encoder {
                 compressor,
                 differences,
             } => {
-                for (to, row) in differences.chunks_exact_mut(EDGE).zip(voxels.chunks(pitch)) {
-                    to[0] = row[0];
-                    for (to, pair) in to[1..].iter_mut().zip(row.windows(2)) {
-                        *to = pair[1].wrapping_sub(pair[0]);
-                    }
+                let rows = differences.chunks_exact_mut(EDGE * T::DTYPE.bytes());
+                for (to, row) in rows.zip(voxels.chunks(pitch)) {
+                    T::differences(&row[..EDGE], to);
                 }
                 compressor.reset();
                 // More than deflate's bound, so that one call finishes.
-                to.reserve(SUB_TILE_VOXELS + SUB_TILE_VOXELS / 8 + 64);
+                to.reserve(differences.len() + differences.len() / 8 + 64);
                 match compressor.compress_vec(differences, to, FlushCompress::Finish) {
                     Ok(Status::StreamEnd) => {}
                     Ok(_) | Err(_) => return Err(EncodeError::Deflate),
@@ -164,11 +167,7 @@ fn image(voxels: &[u8], pitch: usize) -> Image<&[u8]> {
 }
 
 /// Decodes an abbreviated JPEG stream with the tables of its file.
-pub(super) fn decode_jpeg(
-    tables: &[u8],
-    bytes: &[u8],
-    to: &mut [u8; SUB_TILE_VOXELS],
-) -> Result<(), String> {
+pub(super) fn decode_jpeg(tables: &[u8], bytes: &[u8], to: &mut [u8]) -> Result<(), String> {
     thread_local! {
         // Kept, because making a decoder costs as much as decoding a sub-tile.
         static DECODER: RefCell<Option<(Decompressor, Vec<u8>)>> = const { RefCell::new(None) };
@@ -197,7 +196,6 @@ pub(super) fn decode_jpeg(
         if header.subsamp != Subsamp::Gray || header.is_progressive {
             return Err("a sub-tile is not a grey baseline JPEG".to_owned());
         }
-        let to = &mut to[..];
         let format = PixelFormat::GRAY;
         let image = Image {
             pixels: to,
@@ -214,19 +212,30 @@ fn text(e: turbojpeg::Error) -> String {
     e.to_string()
 }
 
-/// Decodes a deflated sub-tile with horizontal differences.
-pub(super) fn decode_lossless(bytes: &[u8], to: &mut [u8; SUB_TILE_VOXELS]) -> Result<(), String> {
+/// Decodes a deflated sub-tile with horizontal differences to little-endian voxels.
+pub(super) fn decode_lossless(dtype: Dtype, bytes: &[u8], to: &mut [u8]) -> Result<(), String> {
     let mut decoder = Decompress::new(true);
     let status = decoder.decompress(bytes, to, FlushDecompress::Finish);
     let status = status.map_err(|e| e.to_string())?;
-    if status != Status::StreamEnd || decoder.total_out() != SUB_TILE_VOXELS as u64 {
+    if status != Status::StreamEnd || decoder.total_out() != to.len() as u64 {
         return Err("a deflate stream has the wrong length".to_owned());
     }
-    for row in to.chunks_exact_mut(EDGE) {
-        let mut value = 0_u8;
-        for voxel in row {
-            value = value.wrapping_add(*voxel);
-            *voxel = value;
+    for row in to.chunks_exact_mut(EDGE * dtype.bytes()) {
+        match dtype {
+            Dtype::Uint16 => {
+                let mut value = 0_u16;
+                for voxel in row.as_chunks_mut::<2>().0 {
+                    value = value.wrapping_add(u16::from_le_bytes(*voxel));
+                    *voxel = value.to_le_bytes();
+                }
+            }
+            _ => {
+                let mut value = 0_u8;
+                for voxel in row {
+                    value = value.wrapping_add(*voxel);
+                    *voxel = value;
+                }
+            }
         }
     }
     Ok(())

@@ -5,36 +5,41 @@ use glam::UVec2;
 use rayon::prelude::*;
 
 use super::codec::Encoder;
+use super::filter::{EDGE, Filter, TASK_LEVEL, covered};
 use super::layout::{Coded, Parts};
-use super::mean::{
-    MAX_U16_LEVEL, SumPlane, Sums, covered, halve_pixels, halve_sums, means, quadrant,
-};
+use super::mean::{Mean, mean};
+use super::mode::Mode;
 use super::morton::in_morton_order;
+use super::voxel::pixel::Pixel;
 use super::{
-    EncodeError, Encoding, PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS, SubTileEntry, levels_of,
+    EncodeError, Encoding, PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS, SubTileEntry, Voxel,
+    levels_of,
 };
-use crate::image::{GrayImage, MAX_EDGE};
+use crate::image::{Gray, MAX_EDGE};
 
-const EDGE: usize = SUB_TILE_EDGE as usize;
+/// Makes the pyramid of an image by averages, as the bytes of a TIFF file. Runs on rayon's threads.
+///
+/// # Errors
+///
+/// [`EncodeError`]; also for JPEG of 16 bits.
+pub fn encode<T: Voxel>(image: &Gray<T>, encoding: &Encoding) -> Result<Bytes, EncodeError> {
+    Ok(parts::<Mean<T>>(image, encoding)?.file())
+}
 
-/// Level of which one sub-tile, with all that it covers, is one thread's piece of work: a
-/// megapixel, small enough to share out, and its sums stay in the processor's cache.
-const TASK_LEVEL: usize = 3;
-const _: () = assert!(
-    TASK_LEVEL < MAX_U16_LEVEL,
-    "a task hands on the sums of the next level"
-);
-
-/// Makes the pyramid of an image, as the bytes of a TIFF file. Runs on rayon's threads.
+/// Makes the pyramid of an image of labels: a coarser pixel has the label that most of the level-0
+/// pixels it covers have; of several, the smallest. Every label comes back as it was.
 ///
 /// # Errors
 ///
 /// [`EncodeError`].
-pub fn encode(image: &GrayImage, encoding: &Encoding) -> Result<Bytes, EncodeError> {
-    Ok(parts(image, encoding)?.file())
+pub fn encode_labels<T: Voxel>(image: &Gray<T>) -> Result<Bytes, EncodeError> {
+    Ok(parts::<Mode<T>>(image, &Encoding::Lossless)?.file())
 }
 
-pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, EncodeError> {
+pub(super) fn parts<F: Filter>(
+    image: &Gray<F::Pixel>,
+    encoding: &Encoding,
+) -> Result<Parts, EncodeError> {
     let (width, height) = (image.width, image.height);
     let edges = 1..=MAX_EDGE;
     let voxels = u64::from(width) * u64::from(height);
@@ -45,6 +50,7 @@ pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, Enc
             voxels: image.voxels.len(),
         });
     }
+    let dtype = F::Pixel::DTYPE;
     let levels = levels_of(width, height);
     let task_level = TASK_LEVEL.min(levels.len() - 1);
     let tasks = in_morton_order(levels[task_level].sub_tiles);
@@ -53,11 +59,11 @@ pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, Enc
         |encoder, at| {
             let encoder = match encoder {
                 Some(encoder) => encoder,
-                None => encoder.insert(Encoder::new(encoding)?),
+                None => encoder.insert(Encoder::new(encoding, dtype)?),
             };
-            let mut task = Task::new(image, &levels, encoder);
+            let mut task = Task::<F>::new(image, &levels, encoder);
             task.sub_tile(task_level, at)?;
-            Ok((at, task.sums.pop(), task.done))
+            Ok((at, task.blocks.pop(), task.done))
         },
     );
     let tasks = tasks.collect::<Result<Vec<_>, EncodeError>>()?;
@@ -65,33 +71,34 @@ pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, Enc
     let mut coded: Vec<Vec<Coded>> = levels.iter().map(|_| Vec::new()).collect();
     let mut plane = levels
         .get(task_level + 1)
-        .map(|l| SumPlane::new(l.width, l.height));
-    for (at, sums, done) in tasks {
+        .map(|l| F::plane(l.width, l.height));
+    for (at, block, done) in tasks {
         for (coded, done) in coded.iter_mut().zip(done) {
             coded.push(done);
         }
-        if let (Some(plane), Some(sums)) = (&mut plane, sums) {
-            plane.put(at, &sums);
+        if let (Some(plane), Some(block)) = (&mut plane, block) {
+            F::put(plane, at, block);
         }
     }
 
     // What is left is a 256th of the image.
-    let mut encoder = Encoder::new(encoding)?;
-    let mut task = Task::new(image, &levels, &mut encoder);
+    let mut encoder = Encoder::new(encoding, dtype)?;
+    let mut task = Task::<F>::new(image, &levels, &mut encoder);
     for (level, size) in levels.iter().enumerate().skip(task_level + 1) {
-        let Some(sums) = plane.take() else { break };
-        let pixels = sums.means(level, (width, height));
+        let Some(known) = plane.take() else { break };
+        let pixels = F::plane_values(&known, level, (width, height));
         for at in in_morton_order(size.sub_tiles) {
-            task.encode_part(level, at, &pixels, sums.width)?;
+            task.encode_part(level, at, &pixels, size.width as usize)?;
         }
-        plane = Some(sums.halved());
+        plane = Some(F::halved(known));
     }
     for (coded, done) in coded.iter_mut().zip(task.done).skip(task_level + 1) {
         coded.push(done);
     }
-    let blank = encoder.blank()?;
+    let blank = encoder.blank::<F::Pixel>()?;
     Ok(Parts {
         levels,
+        dtype,
         coded,
         blank,
         jpeg_tables: encoder.tables().map(Into::into),
@@ -99,26 +106,30 @@ pub(super) fn parts(image: &GrayImage, encoding: &Encoding) -> Result<Parts, Enc
 }
 
 /// Encodes sub-tiles and what they cover.
-struct Task<'a> {
-    image: &'a GrayImage,
+struct Task<'a, F: Filter> {
+    image: &'a Gray<F::Pixel>,
     levels: &'a [PyramidLevel],
     encoder: &'a mut Encoder,
-    /// Sums of the sub-tile at hand of levels 1 to the one above the task's.
-    sums: Vec<Box<Sums>>,
-    voxels: Box<[u8; SUB_TILE_VOXELS]>,
+    /// What is known of the sub-tile at hand of levels 1 to the one above the task's.
+    blocks: Vec<F::Block>,
+    voxels: Box<[F::Pixel; SUB_TILE_VOXELS]>,
     /// Finished sub-tiles per level.
     done: Vec<Coded>,
 }
 
-impl<'a> Task<'a> {
-    fn new(image: &'a GrayImage, levels: &'a [PyramidLevel], encoder: &'a mut Encoder) -> Self {
-        let sums = (0..=TASK_LEVEL.min(levels.len() - 1)).map(|_| Box::new([0; SUB_TILE_VOXELS]));
+impl<'a, F: Filter> Task<'a, F> {
+    fn new(
+        image: &'a Gray<F::Pixel>,
+        levels: &'a [PyramidLevel],
+        encoder: &'a mut Encoder,
+    ) -> Self {
+        let blocks = (0..=TASK_LEVEL.min(levels.len() - 1)).map(|_| F::block());
         Self {
             image,
             levels,
             encoder,
-            sums: sums.collect(),
-            voxels: Box::new([0; SUB_TILE_VOXELS]),
+            blocks: blocks.collect(),
+            voxels: Box::new([F::Pixel::default(); SUB_TILE_VOXELS]),
             done: levels.iter().map(|_| Coded::default()).collect(),
         }
     }
@@ -126,18 +137,17 @@ impl<'a> Task<'a> {
     /// Encodes a sub-tile after all finer ones that it covers: the order of the curve, and each
     /// pixel is still in the cache when its sum is needed.
     fn sub_tile(&mut self, level: usize, at: UVec2) -> Result<(), EncodeError> {
-        let quadrant = quadrant(at.x, at.y);
         let (width, height) = self.size(level, at);
         let Some(finer) = level.checked_sub(1) else {
             let image = self.image;
             let pitch = image.width as usize;
             self.encode_part(0, at, &image.voxels, pitch)?;
             let corner = at.y as usize * EDGE * pitch + at.x as usize * EDGE;
-            let to = &mut self.sums[0][quadrant..];
-            halve_pixels(&image.voxels[corner..], pitch, (width, height), to);
+            let pixels = &image.voxels[corner..];
+            F::take_pixels(&mut self.blocks[0], at, pixels, pitch, (width, height));
             return Ok(());
         };
-        self.sums[finer].fill(0);
+        F::clear(&mut self.blocks[finer]);
         for (x, y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
             let at = at * 2 + UVec2::new(x, y);
             if at.cmplt(self.levels[finer].sub_tiles).all() {
@@ -157,16 +167,16 @@ impl<'a> Task<'a> {
         } else {
             full
         };
-        means(
-            &self.sums[finer],
+        F::values(
+            &self.blocks[finer],
             level,
             (width, height),
             (columns, rows),
             &mut self.voxels,
         );
         self.finish(level, at, (width, height))?;
-        let (finer, coarser) = self.sums.split_at_mut(level);
-        halve_sums(&finer[level - 1], &mut coarser[0][quadrant..]);
+        let (finer, coarser) = self.blocks.split_at_mut(level);
+        F::take_block(&mut coarser[0], at, &finer[level - 1]);
         Ok(())
     }
 
@@ -182,7 +192,7 @@ impl<'a> Task<'a> {
         &mut self,
         level: usize,
         at: UVec2,
-        pixels: &[u8],
+        pixels: &[F::Pixel],
         pitch: usize,
     ) -> Result<(), EncodeError> {
         let (width, height) = self.size(level, at);
@@ -230,7 +240,7 @@ impl<'a> Task<'a> {
 }
 
 /// Repeats the last column and row: the sharp edge of any other padding would ring through JPEG.
-fn pad(voxels: &mut [u8; SUB_TILE_VOXELS], width: usize, height: usize) {
+fn pad<T: Pixel>(voxels: &mut [T; SUB_TILE_VOXELS], width: usize, height: usize) {
     for row in voxels.chunks_exact_mut(EDGE).take(height) {
         let last = row[width - 1];
         row[width..].fill(last);
@@ -242,21 +252,25 @@ fn pad(voxels: &mut [u8; SUB_TILE_VOXELS], width: usize, height: usize) {
 }
 
 /// The values of `height` rows of `width` pixels; `None` if all are 0. The place is filled in later.
-fn entry_of(pixels: &[u8], pitch: usize, (width, height): (usize, usize)) -> Option<SubTileEntry> {
-    let (mut min, mut max, mut sum) = (u8::MAX, 0, 0);
+fn entry_of<T: Pixel>(
+    pixels: &[T],
+    pitch: usize,
+    (width, height): (usize, usize),
+) -> Option<SubTileEntry> {
+    let (mut min, mut max, mut sum) = (pixels[0], pixels[0], 0_u32);
     for row in pixels.chunks(pitch).take(height) {
         let row = &row[..width];
         min = row.iter().fold(min, |a, &b| a.min(b));
         max = row.iter().fold(max, |a, &b| a.max(b));
-        sum += row.iter().map(|&v| u32::from(v)).sum::<u32>();
+        // 2^14 values of 16 bits.
+        sum += row.iter().map(|&v| u32::from(v.value())).sum::<u32>();
     }
-    let n = u32::try_from(width * height).expect("no more than a sub-tile");
-    let mean = super::mean::mean(sum, n);
-    (max > 0).then_some(SubTileEntry {
+    let mean: T = mean(sum.into(), (width * height) as u64);
+    (max > T::default()).then_some(SubTileEntry {
         offset: 0,
         len: 0,
-        min,
-        max,
-        mean,
+        min: min.value(),
+        max: max.value(),
+        mean: mean.value(),
     })
 }

@@ -68,6 +68,9 @@ pub enum EncodeError {
         /// What it said.
         source: turbojpeg::Error,
     },
+    /// JPEG of more than 8 bits.
+    #[error("JPEG holds 8 bits, the image has 16; store it losslessly, or as an image of 8 bits")]
+    JpegDepth,
     /// The JPEG encoder's streams do not share their tables, as this version's do.
     #[error("the JPEG encoder writes other headers than expected; store the tiles losslessly")]
     Headers,

@@ -3,6 +3,7 @@ use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
 use glam::UVec2;
+use saccade_core::volume::Dtype;
 
 use super::parse::{self, Description};
 use super::{PyramidError, PyramidLevel, SUB_TILE_VOXELS, SubTileEntry, codec};
@@ -25,7 +26,7 @@ pub struct SubTileRead {
 
 /// A pyramid's index: where its sub-tiles are, and the ranges of their values.
 ///
-/// Cheap to clone. Takes 16 bytes per sub-tile.
+/// Cheap to clone. Takes 24 bytes per sub-tile.
 #[derive(Clone, Debug)]
 pub struct PyramidIndex {
     name: Arc<str>,
@@ -33,6 +34,7 @@ pub struct PyramidIndex {
     /// Row by row, for each level.
     entries: Arc<[Vec<SubTileEntry>]>,
     jpeg_tables: Option<Arc<[u8]>>,
+    dtype: Dtype,
 }
 
 impl PyramidIndex {
@@ -80,6 +82,7 @@ impl PyramidIndex {
         let Description {
             levels,
             jpeg_tables,
+            dtype,
         } = described.map_err(|reason| PyramidError::Broken {
             reason,
             name: name.to_owned(),
@@ -90,12 +93,23 @@ impl PyramidIndex {
             levels: levels.into(),
             entries: entries.into(),
             jpeg_tables: jpeg_tables.map(Into::into),
+            dtype,
         })
     }
 
     /// The object the index was read from.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// Type of the voxels.
+    pub fn dtype(&self) -> Dtype {
+        self.dtype
+    }
+
+    /// Bytes of a decoded sub-tile: [`SUB_TILE_VOXELS`] of the voxels' type.
+    pub fn sub_tile_bytes(&self) -> usize {
+        SUB_TILE_VOXELS * self.dtype.bytes()
     }
 
     /// Sizes of the levels, the finest first; at least one.
@@ -173,8 +187,8 @@ impl PyramidIndex {
         reads
     }
 
-    /// Decodes a sub-tile from the bytes its entry names to [`SUB_TILE_VOXELS`] values, x fastest.
-    /// The bytes of a blank one do not matter.
+    /// Decodes a sub-tile from the bytes its entry names to [`SUB_TILE_VOXELS`] values, x fastest, as
+    /// little-endian bytes of [`PyramidIndex::dtype`]. The bytes of a blank one do not matter.
     ///
     /// # Errors
     ///
@@ -186,26 +200,31 @@ impl PyramidIndex {
         y: u32,
         bytes: &[u8],
     ) -> Result<Vec<u8>, PyramidError> {
-        let mut voxels = vec![0; SUB_TILE_VOXELS];
-        let to = voxels.as_mut_array().expect("as many as were asked for");
-        self.decode_sub_tile_into(level, x, y, bytes, to)?;
+        let mut voxels = vec![0; self.sub_tile_bytes()];
+        self.decode_sub_tile_into(level, x, y, bytes, &mut voxels)?;
         Ok(voxels)
     }
 
-    /// The same into a place of the caller's.
+    /// The same into a place of the caller's, of [`PyramidIndex::sub_tile_bytes`].
     ///
     /// # Errors
     ///
     /// [`PyramidError::Broken`], after which `to` may hold anything, and
     /// [`PyramidError::OutOfRange`].
+    ///
+    /// # Panics
+    ///
+    /// If `to` has another length.
     pub fn decode_sub_tile_into(
         &self,
         level: usize,
         x: u32,
         y: u32,
         bytes: &[u8],
-        to: &mut [u8; SUB_TILE_VOXELS],
+        to: &mut [u8],
     ) -> Result<(), PyramidError> {
+        let len = self.sub_tile_bytes();
+        assert_eq!(to.len(), len, "a decoded sub-tile has {len} bytes");
         let Some(entry) = self.sub_tile(level, x, y) else {
             return Err(PyramidError::OutOfRange {
                 level,
@@ -220,15 +239,25 @@ impl PyramidIndex {
         }
         let decoded = match &self.jpeg_tables {
             Some(tables) => codec::decode_jpeg(tables, bytes, to),
-            None => codec::decode_lossless(bytes, to),
+            None => codec::decode_lossless(self.dtype, bytes, to),
         };
         decoded.map_err(|reason| PyramidError::Broken {
             reason: format!("sub-tile {x}, {y} of level {level}: {reason}"),
             name: self.name.to_string(),
         })?;
         // JPEG overshoots at edges. Nothing may lie outside the bounds that others cull by.
-        for voxel in to {
-            *voxel = (*voxel).clamp(entry.min, entry.max);
+        // What is lossless lies outside only if the file is damaged.
+        let SubTileEntry { min, max, .. } = entry;
+        if self.dtype == Dtype::Uint16 {
+            for voxel in to.as_chunks_mut::<2>().0 {
+                *voxel = u16::from_le_bytes(*voxel).clamp(min, max).to_le_bytes();
+            }
+        } else {
+            let byte = |v: u16| u8::try_from(v).unwrap_or(u8::MAX);
+            let (min, max) = (byte(min), byte(max));
+            for voxel in to {
+                *voxel = (*voxel).clamp(min, max);
+            }
         }
         Ok(())
     }

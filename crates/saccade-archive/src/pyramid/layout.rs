@@ -6,6 +6,7 @@
 
 use bytes::Bytes;
 use glam::UVec2;
+use saccade_core::volume::Dtype;
 
 use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry};
 
@@ -27,7 +28,7 @@ pub(super) const SUB_IFDS: u16 = 330;
 pub(super) const JPEG_TABLES: u16 = 347;
 /// Private: bytes from the file's beginning that hold everything but sub-tiles.
 pub(super) const INDEX_LEN: u16 = 65_000;
-/// Private: min, max, mean of each sub-tile, in the order of the offsets.
+/// Private: min, max, mean of each sub-tile, in the order of the offsets, of the voxels' type.
 pub(super) const SUB_TILE_STATS: u16 = 65_001;
 
 pub(super) const COMPRESSION_JPEG: u16 = 7;
@@ -40,6 +41,16 @@ pub(super) const SHORT: u16 = 3;
 pub(super) const LONG: u16 = 4;
 pub(super) const UNDEFINED: u16 = 7;
 pub(super) const LONG8: u16 = 16;
+
+/// Bits of a voxel.
+pub(super) fn bits_of(dtype: Dtype) -> u16 {
+    if dtype == Dtype::Uint16 { 16 } else { 8 }
+}
+
+/// The tag type of statistics.
+pub(super) fn stats_kind(dtype: Dtype) -> u16 {
+    if dtype == Dtype::Uint16 { SHORT } else { BYTE }
+}
 
 /// Sub-tiles of one level in the order of the file, and their bytes one after another.
 #[derive(Debug, Default)]
@@ -107,6 +118,7 @@ impl Field {
 #[derive(Debug)]
 pub(super) struct Parts {
     pub(super) levels: Vec<PyramidLevel>,
+    pub(super) dtype: Dtype,
     /// The sub-tiles of each level, in the order they are to have.
     pub(super) coded: Vec<Vec<Coded>>,
     /// The stream that all blank sub-tiles share.
@@ -199,13 +211,18 @@ impl Writer<'_> {
         let tiles = sub_tiles.x as usize * sub_tiles.y as usize;
         let blank_len = u32::try_from(self.parts.blank.len()).expect("a sub-tile is small");
         let mut places = vec![(data, blank_len); tiles];
-        let mut stats = vec![0; 3 * tiles];
+        let bytes = self.parts.dtype.bytes();
+        let mut stats = vec![0; 3 * bytes * tiles];
         let mut begin = begin;
         for part in &self.parts.coded[level] {
             for (at, entry) in part.sub_tiles.iter().filter(|(_, entry)| !entry.is_blank()) {
                 let index = (at.y * sub_tiles.x + at.x) as usize;
                 places[index] = (begin + entry.offset, entry.len);
-                stats[3 * index..][..3].copy_from_slice(&[entry.min, entry.max, entry.mean]);
+                let values = [entry.min, entry.max, entry.mean];
+                let to = stats[3 * bytes * index..].chunks_exact_mut(bytes);
+                for (to, value) in to.zip(values) {
+                    to.copy_from_slice(&value.to_le_bytes()[..bytes]);
+                }
             }
             begin += part.bytes.len() as u64;
         }
@@ -217,7 +234,7 @@ impl Writer<'_> {
             Field::long(NEW_SUBFILE_TYPE, u32::from(level > 0)),
             Field::long(IMAGE_WIDTH, width),
             Field::long(IMAGE_LENGTH, height),
-            Field::short(BITS_PER_SAMPLE, 8),
+            Field::short(BITS_PER_SAMPLE, bits_of(self.parts.dtype)),
             Field::short(
                 COMPRESSION,
                 if self.parts.jpeg_tables.is_some() {
@@ -265,7 +282,7 @@ impl Writer<'_> {
         }
         fields.push(Field {
             tag: SUB_TILE_STATS,
-            kind: BYTE,
+            kind: stats_kind(self.parts.dtype),
             value: stats,
         });
         fields

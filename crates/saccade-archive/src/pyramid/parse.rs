@@ -1,9 +1,12 @@
 //! A pyramid's description, read from bytes that may hold anything.
 
+use saccade_core::volume::Dtype;
+
 use super::layout::{
     BITS_PER_SAMPLE, BYTE, COMPRESSION, COMPRESSION_DEFLATE, COMPRESSION_JPEG, IMAGE_LENGTH,
     IMAGE_WIDTH, INDEX_LEN, JPEG_TABLES, LONG, LONG8, PREDICTOR, PREDICTOR_HORIZONTAL, SHORT,
     SUB_IFDS, SUB_TILE_STATS, TILE_BYTE_COUNTS, TILE_LENGTH, TILE_OFFSETS, TILE_WIDTH, UNDEFINED,
+    bits_of, stats_kind,
 };
 use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry, levels_of};
 use crate::image::MAX_EDGE;
@@ -23,6 +26,7 @@ pub(super) struct Description {
     pub(super) levels: Vec<(PyramidLevel, Vec<SubTileEntry>)>,
     /// Tables of the JPEG streams; `None`: deflate.
     pub(super) jpeg_tables: Option<Vec<u8>>,
+    pub(super) dtype: Dtype,
 }
 
 /// Bytes from a file's beginning that hold its description, by its first bytes.
@@ -53,8 +57,13 @@ pub(super) fn describe(bytes: &[u8]) -> Result<Description, Reason> {
     let (Some(width), Some(height)) = (edge(width), edge(height)) else {
         return Err(format!("its size is {width} x {height}"));
     };
+    let dtype = match first.one(BITS_PER_SAMPLE)? {
+        8 => Dtype::Uint8,
+        16 => Dtype::Uint16,
+        bits => return Err(format!("it has {bits} bits per sample")),
+    };
     let jpeg_tables = match first.one(COMPRESSION)? {
-        c if c == u64::from(COMPRESSION_JPEG) => {
+        c if c == u64::from(COMPRESSION_JPEG) && dtype == Dtype::Uint8 => {
             Some(first.bytes(JPEG_TABLES, UNDEFINED)?.to_vec())
         }
         c if c == u64::from(COMPRESSION_DEFLATE) => None,
@@ -85,7 +94,7 @@ pub(super) fn describe(bytes: &[u8]) -> Result<Description, Reason> {
         let same = [
             (TILE_WIDTH, u64::from(SUB_TILE_EDGE)),
             (TILE_LENGTH, u64::from(SUB_TILE_EDGE)),
-            (BITS_PER_SAMPLE, 8),
+            (BITS_PER_SAMPLE, u64::from(bits_of(dtype))),
             (COMPRESSION, first.one(COMPRESSION)?),
         ];
         let predictor = jpeg_tables
@@ -99,19 +108,25 @@ pub(super) fn describe(bytes: &[u8]) -> Result<Description, Reason> {
                 ));
             }
         }
-        let entries = entries(&directory, level).map_err(|e| format!("level {k}: {e}"))?;
+        let entries = entries(&directory, level, dtype).map_err(|e| format!("level {k}: {e}"))?;
         levels.push((level, entries));
     }
     Ok(Description {
         levels,
         jpeg_tables,
+        dtype,
     })
 }
 
-fn entries(directory: &Directory<'_>, level: PyramidLevel) -> Result<Vec<SubTileEntry>, Reason> {
+fn entries(
+    directory: &Directory<'_>,
+    level: PyramidLevel,
+    dtype: Dtype,
+) -> Result<Vec<SubTileEntry>, Reason> {
     let offsets = directory.offsets(TILE_OFFSETS)?;
     let lens = directory.bytes(TILE_BYTE_COUNTS, LONG)?.as_chunks::<4>().0;
-    let stats = directory.bytes(SUB_TILE_STATS, BYTE)?.as_chunks::<3>().0;
+    let stats = directory.bytes(SUB_TILE_STATS, stats_kind(dtype))?;
+    let stats = stats.chunks_exact(3 * dtype.bytes());
     let count = level.sub_tiles.x as usize * level.sub_tiles.y as usize;
     if [offsets.len(), lens.len(), stats.len()] != [count; 3] {
         return Err(format!("it describes other than {count} sub-tiles"));
@@ -121,7 +136,12 @@ fn entries(directory: &Directory<'_>, level: PyramidLevel) -> Result<Vec<SubTile
         .zip(lens.iter().map(|len| u32::from_le_bytes(*len)));
     places
         .zip(stats)
-        .map(|((offset, len), &[min, max, mean])| {
+        .map(|((offset, len), stats)| {
+            let value = |n: usize| match dtype {
+                Dtype::Uint16 => short(&stats[2 * n..]),
+                _ => stats[n].into(),
+            };
+            let (min, max, mean) = (value(0), value(1), value(2));
             let entry = SubTileEntry {
                 offset,
                 len,

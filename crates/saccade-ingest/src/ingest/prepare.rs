@@ -7,11 +7,14 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use glam::UVec3;
-use saccade_archive::acquisition::{TileRecord, TransformRecord, image_path};
+use saccade_archive::acquisition::{
+    DeleteRecord, TileRecord, TransformRecord, VoxelKind, image_path,
+};
 use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
-use saccade_archive::image::{self, ImageError};
-use saccade_archive::pyramid::{self, Encoding};
+use saccade_archive::image::{self, Image, ImageError, Wanted};
+use saccade_archive::pyramid::{self, EncodeError, Encoding};
 use saccade_archive::storage::{Storage, StorageError};
+use saccade_core::volume::Dtype;
 
 use super::IngestError;
 use crate::progress::Progress;
@@ -42,6 +45,8 @@ pub(super) enum Outcome {
         record: TransformRecord,
         position: u64,
     },
+    /// The tile is no more.
+    Delete { record: DeleteRecord, position: u64 },
     /// The file is not whole yet.
     Wait {
         waiting: Waiting,
@@ -64,12 +69,65 @@ pub(super) enum WaitKind {
     Broken,
 }
 
+/// What becomes of pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Stored {
+    dtype: Dtype,
+    kind: VoxelKind,
+    encoding: Encoding,
+}
+
+impl Stored {
+    /// How the tiles of a volume are stored, and what to say where that is not what was asked for.
+    pub(super) fn new(
+        dtype: Dtype,
+        kind: VoxelKind,
+        asked: Encoding,
+    ) -> (Self, Option<&'static str>) {
+        let (encoding, why) = match asked {
+            Encoding::Jpeg { .. } if kind == VoxelKind::Labels => {
+                let why = "labels are stored losslessly: JPEG keeps numbers only roughly";
+                (Encoding::Lossless, Some(why))
+            }
+            Encoding::Jpeg { .. } if dtype != Dtype::Uint8 => {
+                let why = "tiles of 16 bits are stored losslessly: JPEG holds 8 bits";
+                (Encoding::Lossless, Some(why))
+            }
+            asked => (asked, None),
+        };
+        let stored = Self {
+            dtype,
+            kind,
+            encoding,
+        };
+        (stored, why)
+    }
+
+    fn wanted(self) -> Wanted {
+        Wanted {
+            dtype: self.dtype,
+            labels: self.kind == VoxelKind::Labels,
+        }
+    }
+
+    fn encode(self, image: &Image) -> Result<Bytes, EncodeError> {
+        match (image, self.kind) {
+            (Image::Uint8(image), VoxelKind::Intensity) => pyramid::encode(image, &self.encoding),
+            (Image::Uint16(image), VoxelKind::Intensity) => pyramid::encode(image, &self.encoding),
+            (Image::Uint8(image), VoxelKind::Labels) => pyramid::encode_labels(image),
+            (Image::Uint16(image), VoxelKind::Labels) => pyramid::encode_labels(image),
+        }
+    }
+}
+
 /// What all records share.
 pub(super) struct Context<'a> {
     pub(super) folder: &'a Path,
     pub(super) volume: &'a str,
     pub(super) extent: UVec3,
-    pub(super) encoding: Encoding,
+    /// Names of the volume's channels.
+    pub(super) channels: &'a [String],
+    pub(super) stored: Stored,
     pub(super) storage: &'a dyn Storage,
     pub(super) retry: Duration,
     pub(super) progress: &'a dyn Progress,
@@ -107,10 +165,18 @@ impl Context<'_> {
             );
             return Ok(quarantine(&record, reason, bytes, None));
         }
+        let Some(channel) = record.channel_among(self.channels) else {
+            let reason = format!(
+                "the volume has no such channel; it has {:?}: mend the record's channel and append it \
+                 again, or list the channel in the volume.json of a new acquisition",
+                self.channels,
+            );
+            return Ok(quarantine(&record, reason, bytes, None));
+        };
         let name = pyramid_name(self.volume, &record, position);
         let pyramid = {
-            let (path, record, encoding) = (path.clone(), record.clone(), self.encoding);
-            tokio::task::spawn_blocking(move || build(&path, &record, encoding)).await
+            let (path, record, stored) = (path.clone(), record.clone(), self.stored);
+            tokio::task::spawn_blocking(move || build(&path, &record, stored)).await
         };
         let wait = |reason, kind| {
             let waiting = Waiting {
@@ -141,7 +207,7 @@ impl Context<'_> {
         let tile = NewTile {
             name: record.tile,
             section,
-            channel: 0,
+            channel,
             size,
             transform,
             pyramid: name,
@@ -183,26 +249,29 @@ enum Refusal {
     Never(String),
 }
 
-fn build(path: &Path, record: &TileRecord, encoding: Encoding) -> Result<Bytes, Refusal> {
+fn build(path: &Path, record: &TileRecord, stored: Stored) -> Result<Bytes, Refusal> {
     // Reading a pipe waits for ever, and some devices never end.
     if fs::metadata(path).is_ok_and(|meta| !meta.is_file()) {
         let reason = "this is no regular file (a folder, a pipe or a device); put the image itself \
                       there, and append the record again";
         return Err(Refusal::Never(reason.to_owned()));
     }
-    let image = image::decode_file(path).map_err(|e| match e {
+    let image = image::decode_file_as(path, stored.wanted()).map_err(|e| match e {
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
         ImageError::Broken { .. } => Refusal::Broken(e.to_string()),
         ImageError::Read { ref source, .. } => Refusal::Incomplete(format!("{e}: {source}")),
         _ => Refusal::Never(e.to_string()),
     })?;
-    if [image.width, image.height] != record.size.to_array() {
+    let [width, height] = image.size();
+    if [width, height] != record.size.to_array() {
         return Err(Refusal::Never(format!(
             "the image has {} x {} pixels, but its record says {} x {}; mend the record or the image",
-            image.width, image.height, record.size.x, record.size.y,
+            width, height, record.size.x, record.size.y,
         )));
     }
-    pyramid::encode(&image, &encoding).map_err(|e| Refusal::Never(e.to_string()))
+    stored
+        .encode(&image)
+        .map_err(|e| Refusal::Never(e.to_string()))
 }
 
 pub(super) fn quarantine(
@@ -302,6 +371,7 @@ mod tests {
             section: 3,
             size: UVec2::ONE,
             transform: SectionFromTile::IDENTITY,
+            channel: None,
         };
         let wild = [
             "a",

@@ -13,11 +13,13 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{
     AcquisitionError, AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
 };
-use saccade_archive::catalog::{CatalogError, Quarantined, TileOutcome, TransformOutcome};
+use saccade_archive::catalog::{
+    CatalogError, DeleteOutcome, Quarantined, TileOutcome, TransformOutcome,
+};
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 
-use super::prepare::{Backoff, Context, Outcome};
+use super::prepare::{Backoff, Context, Outcome, Stored};
 use super::waiting::{Due, WaitingRoom};
 use super::{IngestError, IngestOptions};
 use crate::cancel::Cancel;
@@ -42,6 +44,8 @@ pub struct Summary {
     pub pixels: u64,
     /// Tiles moved by transform records.
     pub moved: u64,
+    /// Tiles deleted by records that say so.
+    pub deleted: u64,
     /// Files and records put in quarantine.
     pub quarantined: u64,
     /// Transforms that wait for a tile that has not come, also those of earlier runs.
@@ -79,6 +83,10 @@ pub async fn run(
     let _lock = lock(archive, &volume.name)?;
 
     let catalog = archive.catalog();
+    let (stored, why) = Stored::new(volume.dtype, info.kind, options.encoding);
+    if let Some(why) = why {
+        progress.notice(why);
+    }
     let cursor = catalog.cursor(&volume.name).await?;
     let waiting = catalog.waiting(&volume.name).await?;
     let mut ingest = Ingest {
@@ -88,7 +96,8 @@ pub async fn run(
             folder: acquisition,
             volume: &volume.name,
             extent: volume.extent(),
-            encoding: options.encoding,
+            channels: &volume.channels,
+            stored,
             storage: archive.storage().as_ref(),
             retry: options.retry,
             progress,
@@ -335,6 +344,7 @@ impl From<RecordLine> for Job {
         let work = match line.record {
             Ok(Record::Tile(record)) => Work::Tile(record),
             Ok(Record::Transform(record)) => Work::Done(Outcome::Transform { record, position }),
+            Ok(Record::Delete(record)) => Work::Done(Outcome::Delete { record, position }),
             Err(broken) => {
                 let what = Quarantined {
                     file: RecordReader::FILE.to_owned(),
@@ -429,6 +439,7 @@ impl Committer<'_> {
         self.summary.tiles += done.summary.tiles;
         self.summary.pixels += done.summary.pixels;
         self.summary.moved += done.summary.moved;
+        self.summary.deleted += done.summary.deleted;
         self.summary.quarantined += done.summary.quarantined;
         self.meter.add(done.summary.pixels);
         let left = self.left.fetch_sub(ready.len() as u64, Ordering::Relaxed);
@@ -486,6 +497,13 @@ impl Committer<'_> {
                             done.quarantine(&mut commit, &what).await?;
                         }
                         Err(e) => return Err(e),
+                    }
+                }
+                Outcome::Delete { record, position } => {
+                    let now = SystemTime::now();
+                    match commit.delete(&record.tile, *position, now).await? {
+                        DeleteOutcome::Deleted => done.summary.deleted += 1,
+                        DeleteOutcome::Unchanged | DeleteOutcome::Noted => {}
                     }
                 }
                 Outcome::Wait { waiting, .. } => commit.wait(waiting).await?,

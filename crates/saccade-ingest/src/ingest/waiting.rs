@@ -157,6 +157,7 @@ mod tests {
             section: 0,
             size: UVec2::ONE,
             transform: SectionFromTile::IDENTITY,
+            channel: None,
         };
         Waiting {
             position,

@@ -49,7 +49,7 @@ impl Archive {
                 match line.record {
                     Ok(Record::Tile(tile)) => _ = written.insert(tile.tile),
                     Ok(Record::Transform(moved)) => _ = corrected.insert(moved.tile),
-                    Err(_) => {}
+                    Ok(Record::Delete(_)) | Err(_) => {}
                 }
             }
         }

@@ -103,11 +103,7 @@ impl Plan {
             .max(UVec2::ONE);
         Ok(Self {
             config: config.clone(),
-            info: AcquisitionInfo {
-                name,
-                extent: stack.extent,
-                voxel_nm,
-            },
+            info: AcquisitionInfo::new(&name, stack.extent, voxel_nm),
             grid,
             step,
             slack,

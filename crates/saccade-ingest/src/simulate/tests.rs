@@ -55,7 +55,7 @@ fn records(folder: &Path) -> Vec<Record> {
 fn tiles(folder: &Path) -> Vec<TileRecord> {
     let tile = |record| match record {
         Record::Tile(tile) => Some(tile),
-        Record::Transform(_) => None,
+        Record::Transform(_) | Record::Delete(_) => None,
     };
     records(folder).into_iter().filter_map(tile).collect()
 }
@@ -425,7 +425,7 @@ fn corrections_tell_the_truth_when_asked_to() {
         // Sections in the order of the records; corrections as None.
         let tag = |record: &Record| match record {
             Record::Tile(tile) => Some(tile.section),
-            Record::Transform(_) => None,
+            Record::Transform(_) | Record::Delete(_) => None,
         };
         let mut order: Vec<_> = records(folder).iter().map(tag).collect();
         order.dedup();
@@ -464,6 +464,7 @@ fn corrections_tell_the_truth_when_asked_to() {
                     let off = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
                     assert!(off < 1e-9, "{} is off by {off}", moved.tile);
                 }
+                Record::Delete(deleted) => panic!("{} is deleted", deleted.tile),
             }
         }
         let sent = if corrections == Corrections::Never {
@@ -646,13 +647,9 @@ fn bad_settings_and_folders_are_refused() {
         "nothing was written"
     );
 
-    AcquisitionInfo {
-        name: "other".to_owned(),
-        extent: UVec3::ONE,
-        voxel_nm: DVec3::ONE,
-    }
-    .write(path)
-    .unwrap();
+    AcquisitionInfo::new("other", UVec3::ONE, DVec3::ONE)
+        .write(path)
+        .unwrap();
     let refused = attempt(&config(), path);
     assert!(
         matches!(&refused, SimulateError::NotSimulated { .. }),

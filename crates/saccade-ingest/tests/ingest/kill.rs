@@ -189,6 +189,7 @@ fn record(n: u64) -> Record {
             section,
             size: SIZE,
             transform,
+            channel: None,
         })
     };
     match n {

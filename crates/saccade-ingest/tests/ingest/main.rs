@@ -4,6 +4,7 @@
 
 mod faults;
 mod kill;
+mod kinds;
 mod quarantine;
 mod scope;
 mod stream;

@@ -195,6 +195,7 @@ async fn a_path_out_of_the_archive() {
                 section: 0,
                 size: SIZE,
                 transform: at(0.0, 0.0),
+                channel: None,
             };
             scope.say(&Record::Tile(record));
         })

@@ -70,11 +70,7 @@ impl Scope {
 }
 
 pub(crate) fn info(extent: UVec3) -> AcquisitionInfo {
-    AcquisitionInfo {
-        name: VOLUME.to_owned(),
-        extent,
-        voxel_nm: DVec3::new(4.0, 4.0, 40.0),
-    }
+    AcquisitionInfo::new(VOLUME, extent, DVec3::new(4.0, 4.0, 40.0))
 }
 
 pub(crate) fn tile_record(name: &str, section: u32, size: UVec2) -> Record {
@@ -84,6 +80,7 @@ pub(crate) fn tile_record(name: &str, section: u32, size: UVec2) -> Record {
         section,
         size,
         transform: at(10.0, 20.0),
+        channel: None,
     })
 }
 

@@ -45,6 +45,7 @@ async fn pixels_arrive_as_they_left() {
             tiles: 4,
             pixels: count,
             moved: 0,
+            deleted: 0,
             quarantined: 0,
             early: 0,
         }

@@ -61,8 +61,9 @@ impl Pyramid {
             for x in low.x..=high.x {
                 match self.index.sub_tile(level as usize, x, y) {
                     Some(entry) if !entry.is_blank() => {
-                        let (least, most) = range.unwrap_or((entry.min, entry.max));
-                        range = Some((least.min(entry.min), most.max(entry.max)));
+                        let (min, max) = (byte(entry.min), byte(entry.max));
+                        let (least, most) = range.unwrap_or((min, max));
+                        range = Some((least.min(min), most.max(max)));
                     }
                     _ => blanks = true,
                 }
@@ -192,7 +193,7 @@ impl Tiles {
         for at in wanted {
             let entry = pyramid.index.sub_tile(level as usize, at.x, at.y);
             if let Some(entry) = entry.filter(|e| e.min == e.max && !e.is_blank()) {
-                fetched.push((at, Fetched::Constant(entry.min)));
+                fetched.push((at, Fetched::Constant(byte(entry.min))));
                 continue;
             }
             match self.sub_tiles.get(&key(pyramid, level, at)) {
@@ -255,6 +256,11 @@ impl Tiles {
     pub(super) fn opened(&self) -> u64 {
         self.next_serial.load(Ordering::Relaxed)
     }
+}
+
+/// A value of an 8-bit pyramid.
+fn byte(value: u16) -> u8 {
+    u8::try_from(value).unwrap_or(u8::MAX)
 }
 
 fn key(pyramid: &Pyramid, level: u32, at: UVec2) -> SubTileKey {

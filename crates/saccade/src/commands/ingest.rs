@@ -108,12 +108,16 @@ impl Ingest {
         let Summary {
             tiles,
             moved,
+            deleted,
             quarantined,
             early,
             ..
         } = done?;
         archive.catalog().close().await;
         let mut done = format!("{tiles} tiles taken in, {moved} moved, {quarantined} set aside");
+        if deleted > 0 {
+            done.push_str(&format!(", {deleted} deleted"));
+        }
         if early > 0 {
             done.push_str(&format!(", {early} transforms of tiles that have not come"));
         }

@@ -134,7 +134,10 @@ impl TiffPages {
 fn check_color(color: ColorType) -> Result<(), ImageError> {
     match color {
         ColorType::Gray(8) => Ok(()),
-        ColorType::Gray(bits) => Err(ImageError::Depth { bits: bits.into() }),
+        ColorType::Gray(bits) => Err(ImageError::Depth {
+            bits: bits.into(),
+            volume: 8,
+        }),
         other => Err(ImageError::Unsupported {
             what: format!("{other:?}"),
         }),

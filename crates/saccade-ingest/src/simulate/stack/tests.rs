@@ -179,7 +179,10 @@ fn what_is_wrong_is_said_with_the_file() {
         let depth = matches!(
             &deep,
             StackError::Image {
-                source: ImageError::Depth { bits: 16 },
+                source: ImageError::Depth {
+                    bits: 16,
+                    volume: 8
+                },
                 ..
             }
         );
@@ -283,7 +286,10 @@ fn sixteen_bit_zarrs_need_a_window() {
     let depth = matches!(
         &refused,
         StackError::Image {
-            source: ImageError::Depth { bits: 16 },
+            source: ImageError::Depth {
+                bits: 16,
+                volume: 8
+            },
             ..
         }
     );

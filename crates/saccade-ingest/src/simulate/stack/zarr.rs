@@ -92,7 +92,7 @@ impl ZarrStack {
             (Some(16), Some(window)) => Some(window),
             (bits, _) => {
                 let source = match bits {
-                    Some(bits) => ImageError::Depth { bits },
+                    Some(bits) => ImageError::Depth { bits, volume: 8 },
                     None => ImageError::Unsupported {
                         what: "values that are no unsigned integers".to_owned(),
                     },
