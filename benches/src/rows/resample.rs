@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
 use glam::{DVec2, UVec2};
-use saccade_source::stitched::Patch;
+use saccade_source::stitched::{Interpolation, Patch};
 use serde::Deserialize;
 
 use crate::cpu;
@@ -95,7 +95,12 @@ fn draw(patch: &Patch, degrees: f64) -> Result<f64> {
     let mut pictures = 0;
     loop {
         for (y, row) in (0..).zip(picture.chunks_exact_mut(PICTURE as usize)) {
-            patch.sample(first + down * f64::from(y) + 0.5, along, row);
+            patch.sample(
+                Interpolation::Linear,
+                first + down * f64::from(y) + 0.5,
+                along,
+                row,
+            );
         }
         pictures += 1;
         let took = cpu::time()? - start;

@@ -53,7 +53,9 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
                 let min = UVec2::new(at(extent.x, &mut random), at(extent.y, &mut random));
                 let z = random.below(extent.z);
                 let start = Stopwatch::start();
-                let section = source.cross_section(0, z, min, UVec2::splat(EDGE)).await?;
+                let section = source
+                    .cross_section(0, 0, z, min, UVec2::splat(EDGE))
+                    .await?;
                 times.push(start.elapsed().as_secs_f64() * 1e3);
                 let whole = section.is_some_and(|s| s.size == UVec2::splat(EDGE));
                 ensure!(whole, "a plane at {min}, {z} is not there");

@@ -12,11 +12,15 @@
 //!   tile there; of two equally near ones the first. Of the sections with tiles, in that order, the
 //!   first four are looked at, then the 8th, 16th, 32nd and so on: a voxel that spans thousands of
 //!   sections asks a dozen.
-//!   Where it spans none, see [`Gaps`].
-//! - A tile is there if the sample lies in the tile's rectangle (low edges included, high ones not)
-//!   and not in a blank sub-tile. Where several are, the one whose centre is nearest wins, then the
-//!   one that changed last, then the one with the larger id.
-//! - The value is interpolated linearly in the pyramid level whose pixels are most like the voxel
+//!   A section counts as soon as it has a tile of any channel. Where a voxel spans none, see [`Gaps`];
+//!   [`AlongZ`] says what else one can be that spans several.
+//! - A tile is there if it is of the voxel's channel and the sample lies in the tile's rectangle (low edges
+//!   included, high ones not) and not in a blank sub-tile. Of several, those count whose pixels are at
+//!   most one and a half times as large as the smallest ones there: a region imaged at a high magnification is
+//!   seen within an overview at a low one \[003 §3.3\]. Of these, the one whose centre is nearest
+//!   wins, then the one that changed last, then the one with the larger id; or all are blended
+//!   ([`Overlaps`]).
+//! - The value is interpolated linearly, or as [`Interpolation`] says, in the pyramid level whose pixels are most like the voxel
 //!   in size, with the tile's edge pixels repeated outward; it is at least 1. Where no tile is: 0.
 //! - Where a voxel is larger than the pixels of a tile's coarsest level, it is the mean of 2 x 2,
 //!   4 x 4, at most 16 x 16 such samples, those that are 0 left out. The largest tile pixels near
@@ -36,6 +40,7 @@ mod along_z;
 mod block;
 mod blocks;
 mod build;
+mod canvas;
 mod coverage;
 mod error;
 mod follow;
@@ -49,7 +54,7 @@ use std::time::Duration;
 use glam::UVec2;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::CatalogError;
-use saccade_core::volume::{Dtype, Volume};
+use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use tokio::runtime::Handle;
 use tokio::sync::Semaphore;
@@ -60,15 +65,16 @@ use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource};
 use block::{BlockGrid, CutChunk};
 use blocks::Blocks;
-use build::Builder;
+use build::{Builder, Place};
 use tiles::Tiles;
 
-pub use along_z::Gaps;
+pub use along_z::{AlongZ, Gaps};
+pub use coverage::Overlaps;
 pub use error::StitchError;
 pub use index::{SectionIndex, TileIndex, TileUpdate};
-pub use resample::Patch;
+pub use resample::{Interpolation, Patch, Sample};
 
-/// Limits of a [`StitchedSource`].
+/// How a [`StitchedSource`] stitches, and its limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StitchedOptions {
     /// Memory for finished blocks \[bytes\].
@@ -79,6 +85,12 @@ pub struct StitchedOptions {
     pub index_bytes: u64,
     /// Blocks built at a time.
     pub builds: usize,
+    /// What lies between pixels.
+    pub interpolation: Interpolation,
+    /// What is seen where tiles overlap.
+    pub overlaps: Overlaps,
+    /// What a voxel is that spans several sections.
+    pub along_z: AlongZ,
     /// What is shown in place of sections that have no tile.
     pub gaps: Gaps,
     /// How long chunks fail that show a tile which cannot be read, until it is tried again.
@@ -91,6 +103,9 @@ impl Default for StitchedOptions {
             block_bytes: 512 << 20,
             sub_tile_bytes: 256 << 20,
             index_bytes: 64 << 20,
+            interpolation: Interpolation::Linear,
+            overlaps: Overlaps::NearestCentre,
+            along_z: AlongZ::Nearest,
             gaps: Gaps::Empty,
             try_again: Duration::from_secs(3),
             builds: std::thread::available_parallelism().map_or(2, usize::from),
@@ -123,7 +138,7 @@ pub struct StitchedStatistics {
 pub struct CrossSection {
     /// Voxels along x and y.
     pub size: UVec2,
-    /// Their values, x fastest.
+    /// Their values, x fastest; of 16 bits little-endian.
     pub values: Vec<u8>,
 }
 
@@ -156,7 +171,7 @@ impl StitchedSource {
     /// # Errors
     ///
     /// [`SourceError::NoVolume`] if the archive has none of that name, [`SourceError::Open`] if its
-    /// catalog cannot be read or the volume is not of one 8-bit channel.
+    /// catalog cannot be read.
     pub async fn open(
         archive: &VisualizationArchive,
         name: &str,
@@ -180,11 +195,8 @@ impl StitchedSource {
         };
         let entry = catalog.entry(name).await.map_err(failed)?;
         let volume = Arc::new(entry.volume);
-        if volume.dtype != Dtype::Uint8 || volume.channels.len() != 1 {
-            return Err(open_error(StitchError::Kind));
-        }
         let index = TileIndex::open(&catalog, name).await.map_err(failed)?;
-        let tiles = Tiles::new(archive, index, &options);
+        let tiles = Tiles::new(archive, index, volume.dtype, &options);
         let inner = Arc::new(Inner {
             grid: BlockGrid::new(&volume),
             blocks: Blocks::new(options.block_bytes),
@@ -204,7 +216,7 @@ impl StitchedSource {
         self.inner.builder.tiles().index()
     }
 
-    /// One z of a level, cut out at `min` and `size` voxels large, x fastest; `None` where nothing was
+    /// One z of a channel's level, cut out at `min` and `size` voxels large, x fastest; `None` where nothing was
     /// acquired. Built alone, and not kept: a picture of a plane costs a plane, not a block. Voxels
     /// past the level's end are left out.
     ///
@@ -217,6 +229,7 @@ impl StitchedSource {
     /// If the volume has no such level.
     pub async fn cross_section(
         &self,
+        channel: u32,
         level: u32,
         z: u32,
         min: UVec2,
@@ -228,7 +241,12 @@ impl StitchedSource {
         if voxels.is_empty() {
             return Ok(None);
         }
-        let values = self.inner.builder.cross_section(voxels, level).await?;
+        let place = Place {
+            channel,
+            level,
+            voxels,
+        };
+        let values = self.inner.builder.cross_section(place).await?;
         let size = voxels.size().truncate();
         Ok(values.map(|values| CrossSection { size, values }))
     }
@@ -299,7 +317,12 @@ impl VolumeSource for StitchedSource {
             if let Some(range) = self.value_range(id) {
                 return Ok(Some(range));
             }
-            let found = self.inner.builder.range(voxels, id.level).await;
+            let place = Place {
+                channel: id.channel,
+                level: id.level,
+                voxels,
+            };
+            let found = self.inner.builder.range(place).await;
             found.map_err(|source| failed(id, Arc::new(source)))
         })
     }

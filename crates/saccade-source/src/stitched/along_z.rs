@@ -3,6 +3,7 @@
 use saccade_core::levels::Level;
 
 use super::index::TileIndex;
+use super::resample::Sample;
 use glam::DVec2;
 
 /// Of the sections that a voxel spans, all of these nearest ones are looked at; of those behind, ever
@@ -33,19 +34,36 @@ impl Gaps {
     }
 }
 
+/// What a voxel is that spans several sections.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum AlongZ {
+    /// What the section nearest to its centre has.
+    #[default]
+    Nearest,
+    /// What lies at its centre, in proportion between the nearest sections below and above that it spans.
+    /// Where there is a tile on one side only, what is there.
+    Linear,
+}
+
 /// Where a voxel's samples come from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Sections {
     /// The first of these that has a tile there.
     FirstOf(Vec<u32>),
-    /// Two sections around a gap; of the upper one this many parts of 256.
-    Between(u32, u32, u32),
+    /// The first of each of these that has a tile there; of the second ones this many parts of
+    /// 65,536.
+    Between(Vec<u32>, Vec<u32>, u32),
 }
 
 impl Sections {
     /// Of voxel `z` of a level: those it spans that have tiles, the one nearest its centre first, as
     /// far as they are looked at; or those around it.
-    pub(super) fn of(index: &TileIndex, gaps: Gaps, level: Level, z: u32) -> Self {
+    pub(super) fn of(
+        index: &TileIndex,
+        (along_z, gaps): (AlongZ, Gaps),
+        level: Level,
+        z: u32,
+    ) -> Self {
         let span = level.downsampling.z;
         let z = f64::from(z);
         // Those whose middle lies within the voxel.
@@ -61,9 +79,8 @@ impl Sections {
                 .filter(|(a, b)| b - a - 1 <= gaps.longest());
             return match (gap, gaps) {
                 (Some((below, above)), Gaps::Linear(_)) => {
-                    let part = -offset(&below) / f64::from(above - below) * 256.0;
-                    let part = DVec2::splat(part.round()).as_uvec2().x;
-                    Self::Between(below, above, part.min(256))
+                    let part = part_of_upper(-offset(&below), offset(&above));
+                    Self::Between(vec![below], vec![above], part)
                 }
                 (Some((below, above)), _) if -offset(&below) <= offset(&above) => {
                     Self::FirstOf(vec![below])
@@ -76,19 +93,35 @@ impl Sections {
         sections.sort_by(|a, b| offset(a).abs().total_cmp(&offset(b).abs()));
         let ranked = (1_usize..).zip(sections);
         let looked_at = ranked.filter(|(rank, _)| *rank <= NEAR_SECTIONS || rank.is_power_of_two());
-        Self::FirstOf(looked_at.map(|(_, section)| section).collect())
+        let sections: Vec<u32> = looked_at.map(|(_, section)| section).collect();
+        if along_z == AlongZ::Linear && { sections.iter() }.all(|section| offset(section) != 0.0) {
+            let side =
+                |below: bool| { sections.iter() }.filter(move |s| (offset(s) < 0.0) == below);
+            if let (Some(low), Some(high)) = (side(true).next(), side(false).next()) {
+                let part = part_of_upper(-offset(low), offset(high));
+                let [below, above] = [true, false].map(|below| side(below).copied().collect());
+                return Self::Between(below, above, part);
+            }
+        }
+        Self::FirstOf(sections)
     }
 }
 
-/// Values of a plane between two others, of the upper one `part` of 256. 0 is no value.
-pub(super) fn between(below: &mut [u8], above: &[u8], part: u32) {
+/// Parts of 65,536 that the upper of two sections has, so far from each.
+fn part_of_upper(from_lower: f64, from_upper: f64) -> u32 {
+    let part = from_lower / (from_lower + from_upper) * 65_536.0;
+    DVec2::splat(part.round()).as_uvec2().x.min(65_536)
+}
+
+/// Values of a plane between two others, of the upper one `part` of 65,536. 0 is no value.
+pub(super) fn between<S: Sample>(below: &mut [S], above: &[S], part: u32) {
     for (below, above) in below.iter_mut().zip(above) {
-        let [a, b] = [*below, *above].map(u32::from);
-        let mixed = (a * (256 - part) + b * part + 128) >> 8;
+        let [a, b] = [*below, *above].map(|v| u32::from(v.into()));
+        let mixed = (a * (65_536 - part) + b * part + 32_768) >> 16;
         *below = match (a, b) {
             (0, _) => *above,
             (_, 0) => *below,
-            _ => u8::try_from(mixed).unwrap_or(u8::MAX),
+            _ => S::of(u16::try_from(mixed).unwrap_or(u16::MAX)),
         };
     }
 }

@@ -13,6 +13,7 @@ use tokio::time::Instant;
 use super::coverage::Segment;
 use super::error::StitchError;
 use super::index::IndexedTile;
+use super::resample::Sample;
 use crate::{ChunkId, ValueRange};
 
 /// Voxels of a block, about: whole chunks are taken \[000 §5.2\].
@@ -21,6 +22,7 @@ const BLOCK: UVec3 = UVec3::new(512, 512, 32);
 /// Names a block.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) struct BlockKey {
+    pub(super) channel: u32,
     pub(super) level: u32,
     block: UVec3,
 }
@@ -47,6 +49,7 @@ impl BlockGrid {
     /// The block that holds a chunk, and which of its chunks that is.
     pub(super) fn block_of(&self, id: ChunkId) -> (BlockKey, UVec3) {
         let key = BlockKey {
+            channel: id.channel,
             level: id.level,
             block: id.chunk / self.chunks,
         };
@@ -69,9 +72,9 @@ impl BlockGrid {
 }
 
 /// One z of a block.
-pub(super) struct Slice {
+pub(super) struct Slice<S> {
     /// Without padding, x fastest; `None` if there is nothing.
-    pub(super) values: Option<Vec<u8>>,
+    pub(super) values: Option<Vec<S>>,
     pub(super) failures: Vec<Failure>,
 }
 
@@ -141,10 +144,10 @@ pub(super) struct Block {
 
 impl Block {
     /// Cuts what was built of `voxels`. Where a tile could not be read, it is good for `try_again`.
-    pub(super) fn cut(
+    pub(super) fn cut<S: Sample>(
         voxels: VoxelBox,
         chunk: UVec3,
-        slices: &[Slice],
+        slices: &[Slice<S>],
         try_again: Duration,
     ) -> Self {
         let failed = slices.iter().any(|s| !s.failures.is_empty());
@@ -188,7 +191,7 @@ impl Block {
 }
 
 /// The chunk whose first voxel is `min` \[voxels of the block\].
-fn cut(size: UVec3, chunk: UVec3, min: UVec3, slices: &[Slice]) -> CutChunk {
+fn cut<S: Sample>(size: UVec3, chunk: UVec3, min: UVec3, slices: &[Slice<S>]) -> CutChunk {
     let max = (min + chunk).min(size);
     let own = &slices[min.z as usize..max.z as usize];
     let failures = own.iter().flat_map(|s| &s.failures);
@@ -197,30 +200,30 @@ fn cut(size: UVec3, chunk: UVec3, min: UVec3, slices: &[Slice]) -> CutChunk {
         return CutChunk::Failed(failure.error.clone());
     }
     let [width, height, depth] = chunk.as_usizevec3().to_array();
-    let mut voxels = vec![0; width * height * depth];
-    let (mut least, mut most) = (u8::MAX, 0);
-    for (slice, to) in own.iter().zip(voxels.chunks_exact_mut(width * height)) {
+    let bytes = S::DTYPE.bytes();
+    let mut voxels = vec![0; width * height * depth * bytes];
+    let (mut least, mut most) = (S::MOST, S::default());
+    let planes = voxels.chunks_exact_mut(width * height * bytes);
+    for (slice, to) in own.iter().zip(planes) {
         let Some(values) = &slice.values else {
             continue;
         };
         let rows = values.chunks_exact(size.x as usize);
         let rows = rows.skip(min.y as usize).take((max.y - min.y) as usize);
-        for (row, to) in rows.zip(to.chunks_exact_mut(width)) {
+        for (row, to) in rows.zip(to.chunks_exact_mut(width * bytes)) {
             let row = &row[min.x as usize..max.x as usize];
-            to[..row.len()].copy_from_slice(row);
+            S::write(row, &mut to[..row.len() * bytes]);
             // 0 becomes the largest for the smallest: it is no value.
-            least = row
-                .iter()
-                .fold(least, |least, v| least.min(v.wrapping_sub(1)));
+            least = row.iter().fold(least, |least, v| least.min(v.before()));
             most = row.iter().fold(most, |most, v| most.max(*v));
         }
     }
-    if most == 0 {
+    if most == S::default() {
         return CutChunk::Empty;
     }
     let range = ValueRange {
-        min: u16::from(least) + 1,
-        max: u16::from(most),
+        min: least.into() + 1,
+        max: most.into(),
     };
     CutChunk::Voxels(Bytes::from(voxels), range)
 }

@@ -12,6 +12,7 @@ use tokio::task::JoinHandle;
 
 use super::Inner;
 use super::block::{Block, BlockKey};
+use super::build::Place;
 use super::error::StitchError;
 
 type Built = Result<Arc<Block>, Arc<StitchError>>;
@@ -141,8 +142,12 @@ impl Inner {
         };
         let task = Task(self.runtime.spawn(async move {
             let permit = inner.builds.acquire().await;
-            let voxels = inner.grid.voxels(key);
-            let built = inner.builder.block(&inner.grid, voxels, key.level).await;
+            let place = Place {
+                channel: key.channel,
+                level: key.level,
+                voxels: inner.grid.voxels(key),
+            };
+            let built = inner.builder.block(&inner.grid, place).await;
             drop(permit);
             let block = Arc::new(built.map_err(Arc::new)?);
             landing.keep(&block);

@@ -7,20 +7,20 @@ use std::time::Duration;
 
 use futures::future::{join_all, try_join, try_join_all};
 use futures::stream::{self, StreamExt, TryStreamExt};
-use glam::{DVec2, UVec2};
-use rayon::prelude::*;
+use glam::DVec2;
 use saccade_core::levels::Level;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{Dtype, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::oneshot;
 
-use super::along_z::{Gaps, Sections, between};
+use super::along_z::{AlongZ, Gaps, Sections, between};
 use super::block::{Block, BlockGrid, Failure, Slice};
-use super::coverage::{Candidate, Grid, Segment, Uncovered};
+use super::canvas::Canvas;
+use super::coverage::{Candidate, Grid, Overlaps, Segment, Uncovered};
 use super::error::StitchError;
 use super::index::IndexedTile;
-use super::resample::{Patch, averaged};
-use super::tiles::{Fetched, Tiles};
+use super::resample::{Interpolation, Sample, averaged};
+use super::tiles::Tiles;
 use super::{StitchedOptions, StitchedStatistics};
 use crate::ValueRange;
 
@@ -32,16 +32,33 @@ const SECTIONS_AT_ONCE: usize = 4;
 pub(super) struct Builder {
     volume: Arc<Volume>,
     tiles: Arc<Tiles>,
-    gaps: Gaps,
+    rules: Rules,
     try_again: Duration,
     blocks: AtomicU64,
     voxels: AtomicU64,
 }
 
+/// How it is stitched.
+#[derive(Clone, Copy)]
+pub(super) struct Rules {
+    pub(super) interpolation: Interpolation,
+    pub(super) overlaps: Overlaps,
+    along_z: AlongZ,
+    gaps: Gaps,
+}
+
+/// Voxels of one channel and level.
+#[derive(Clone, Copy)]
+pub(super) struct Place {
+    pub(super) channel: u32,
+    pub(super) level: u32,
+    pub(super) voxels: VoxelBox,
+}
+
 /// What one tile gives to a section of a block.
-struct Part {
-    candidate: Candidate,
-    segments: Vec<Segment>,
+pub(super) struct Part {
+    pub(super) candidate: Candidate,
+    pub(super) segments: Vec<Segment>,
 }
 
 impl Builder {
@@ -49,7 +66,12 @@ impl Builder {
         Self {
             volume,
             tiles: Arc::new(tiles),
-            gaps: options.gaps,
+            rules: Rules {
+                interpolation: options.interpolation,
+                overlaps: options.overlaps,
+                along_z: options.along_z,
+                gaps: options.gaps,
+            },
             try_again: options.try_again,
             blocks: AtomicU64::new(0),
             voxels: AtomicU64::new(0),
@@ -76,7 +98,7 @@ impl Builder {
     /// Whether a box of a level's voxels touches a section that has a tile, or one that shows such.
     pub(super) fn may_have_data(&self, voxels: VoxelBox, level: u32) -> bool {
         let level0 = self.volume.levels[level as usize].voxels_from_box(voxels);
-        let reach = self.gaps.longest();
+        let reach = self.rules.gaps.longest();
         let first = level0.min.z.saturating_sub(reach);
         let end = level0.max.z.saturating_add(reach);
         self.tiles.index().any_acquired(first..end)
@@ -85,7 +107,7 @@ impl Builder {
     /// The level-0 voxels that may be others when those of a box of one section are; `all` of its
     /// sections if it has its first tile, or lost its last.
     pub(super) fn touched(&self, mut voxels: VoxelBox, all: bool) -> VoxelBox {
-        let reach = self.gaps.longest();
+        let reach = self.rules.gaps.longest();
         let extent = self.volume.extent();
         if reach > 0 {
             voxels.min.z = voxels.min.z.saturating_sub(reach);
@@ -98,15 +120,21 @@ impl Builder {
         voxels
     }
 
-    /// Builds the block of these voxels.
-    pub(super) async fn block(
+    /// Builds a block.
+    pub(super) async fn block(&self, grid: &BlockGrid, place: Place) -> Result<Block, StitchError> {
+        match self.volume.dtype {
+            Dtype::Uint16 => self.block_of::<u16>(grid, place).await,
+            _ => self.block_of::<u8>(grid, place).await,
+        }
+    }
+
+    async fn block_of<S: Sample>(
         &self,
         grid: &BlockGrid,
-        voxels: VoxelBox,
-        level: u32,
+        place: Place,
     ) -> Result<Block, StitchError> {
-        let level = self.volume.levels[level as usize];
-        let slices = (voxels.min.z..voxels.max.z).map(|z| self.slice(level, voxels, z));
+        let voxels = place.voxels;
+        let slices = (voxels.min.z..voxels.max.z).map(|z| self.slice::<S>(place, z));
         let slices = stream::iter(slices).buffered(SECTIONS_AT_ONCE);
         let slices: Vec<_> = slices.try_collect().await?;
         self.blocks.fetch_add(1, Ordering::Relaxed);
@@ -116,36 +144,44 @@ impl Builder {
         Ok(block)
     }
 
-    /// Bounds of the values in a box of a level's voxels: of the sub-tiles below it, none of which is
-    /// read. `None` where nothing is.
-    pub(super) async fn range(
-        &self,
-        voxels: VoxelBox,
-        level: u32,
-    ) -> Result<Option<ValueRange>, StitchError> {
-        let level = self.volume.levels[level as usize];
-        let slices = (voxels.min.z..voxels.max.z).map(|z| self.range_of_slice(level, voxels, z));
+    fn level(&self, place: Place) -> Level {
+        self.volume.levels[place.level as usize]
+    }
+
+    fn sections(&self, place: Place, z: u32) -> Sections {
+        let rules = (self.rules.along_z, self.rules.gaps);
+        Sections::of(self.tiles.index(), rules, self.level(place), z)
+    }
+
+    /// Bounds of the values in a box: of the sub-tiles below it, none of which is read. `None` where
+    /// nothing is.
+    pub(super) async fn range(&self, place: Place) -> Result<Option<ValueRange>, StitchError> {
+        let z = place.voxels.min.z..place.voxels.max.z;
+        let slices = z.map(|z| self.range_of_slice(place, z));
         let ranges = stream::iter(slices).buffered(SECTIONS_AT_ONCE);
         let ranges: Vec<_> = ranges.try_collect().await?;
         let range = ranges.into_iter().flatten().reduce(union);
+        let largest = match self.volume.dtype {
+            Dtype::Uint16 => u16::MAX,
+            _ => u16::from(u8::MAX),
+        };
         // What is measured is at least 1.
         Ok(range.map(|(least, most)| ValueRange {
-            min: u16::from(least.max(1)),
-            max: u16::from(most),
+            min: least.clamp(1, largest),
+            max: most.clamp(1, largest),
         }))
     }
 
     async fn range_of_slice(
         &self,
-        level: Level,
-        voxels: VoxelBox,
+        place: Place,
         z: u32,
-    ) -> Result<Option<(u8, u8)>, StitchError> {
-        match Sections::of(self.tiles.index(), self.gaps, level, z) {
-            Sections::FirstOf(sections) => self.range_of(level, voxels, &sections).await,
+    ) -> Result<Option<(u16, u16)>, StitchError> {
+        match self.sections(place, z) {
+            Sections::FirstOf(sections) => self.range_of(place, &sections).await,
             Sections::Between(below, above, _) => {
-                let below = self.range_of(level, voxels, &[below]).await?;
-                let above = self.range_of(level, voxels, &[above]).await?;
+                let below = self.range_of(place, &below).await?;
+                let above = self.range_of(place, &above).await?;
                 Ok(below.into_iter().chain(above).reduce(union))
             }
         }
@@ -153,31 +189,40 @@ impl Builder {
 
     async fn range_of(
         &self,
-        level: Level,
-        voxels: VoxelBox,
+        place: Place,
         sections: &[u32],
-    ) -> Result<Option<(u8, u8)>, StitchError> {
-        let whole = Grid::of_level(level, voxels);
+    ) -> Result<Option<(u16, u16)>, StitchError> {
+        let whole = Grid::of_level(self.level(place), place.voxels);
         let (min, max) = whole.bounds();
         let mut planned: Option<Grid> = None;
         let mut range = None;
         for &section in sections {
-            let near = self.near(section, min, max).await?;
+            let near = self.near(section, place.channel, min, max).await?;
             if near.is_empty() {
                 continue;
             }
             let grid =
                 *planned.get_or_insert_with(|| whole.finer(1 << sampling(&near, whole.step)));
             let opened = near.iter().map(|tile| self.tiles.pyramid(tile));
-            let mut covered = false;
-            for (tile, pyramid) in near.iter().zip(try_join_all(opened).await?) {
-                let candidate = Candidate::new(tile.clone(), pyramid, &grid);
-                let (seen, whole) = candidate.range(&grid);
-                range = range.into_iter().chain(seen).reduce(union);
-                covered |= whole;
+            let opened = try_join_all(opened).await?;
+            let candidates = near.into_iter().zip(opened);
+            let candidates = candidates.map(|(tile, pyramid)| Candidate::new(tile, pyramid, &grid));
+            let ranges = candidates.map(|candidate| {
+                let (seen, covers) = candidate.range(&grid, self.rules.interpolation);
+                (candidate, seen, covers)
+            });
+            let ranges: Vec<_> = ranges.collect();
+            for (candidate, seen, _) in &ranges {
+                // A finer tile that covers all hides it.
+                let hides = |(other, _, covers): &(Candidate, _, bool)| {
+                    *covers && !candidate.is_fine_beside(other)
+                };
+                if !ranges.iter().any(hides) {
+                    range = range.into_iter().chain(*seen).reduce(union);
+                }
             }
             // Other sections are hidden.
-            if covered {
+            if ranges.iter().any(|(_, _, covers)| *covers) {
                 break;
             }
         }
@@ -188,39 +233,50 @@ impl Builder {
     async fn near(
         &self,
         section: u32,
+        channel: u32,
         min: DVec2,
         max: DVec2,
     ) -> Result<Vec<Arc<IndexedTile>>, StitchError> {
         let index = self.tiles.index().section(section).await;
         let index = index.map_err(|source| StitchError::Catalog { source })?;
-        Ok(index.near(min, max))
+        Ok(index.near(channel, min, max))
     }
 
-    /// Stitches one z of some voxels of a level, without those around it.
+    /// Stitches one z of some voxels, without those around it, to little-endian values.
     pub(super) async fn cross_section(
         &self,
-        voxels: VoxelBox,
-        level: u32,
+        place: Place,
     ) -> Result<Option<Vec<u8>>, Arc<StitchError>> {
-        let level = self.volume.levels[level as usize];
-        let slice = self
-            .slice(level, voxels, voxels.min.z)
-            .await
-            .map_err(Arc::new)?;
+        match self.volume.dtype {
+            Dtype::Uint16 => self.cross_section_of::<u16>(place).await,
+            _ => self.cross_section_of::<u8>(place).await,
+        }
+    }
+
+    async fn cross_section_of<S: Sample>(
+        &self,
+        place: Place,
+    ) -> Result<Option<Vec<u8>>, Arc<StitchError>> {
+        let slice = self.slice::<S>(place, place.voxels.min.z).await;
+        let slice = slice.map_err(Arc::new)?;
         match slice.failures.first() {
             Some(failure) => Err(failure.error()),
-            None => Ok(slice.values),
+            None => Ok(slice.values.map(|values| {
+                let mut bytes = vec![0; values.len() * S::DTYPE.bytes()];
+                S::write(&values, &mut bytes);
+                bytes
+            })),
         }
     }
 
     /// Stitches one z of a block.
-    async fn slice(&self, level: Level, voxels: VoxelBox, z: u32) -> Result<Slice, StitchError> {
-        let (below, above, part) = match Sections::of(self.tiles.index(), self.gaps, level, z) {
-            Sections::FirstOf(sections) => return self.first_of(level, voxels, sections).await,
+    async fn slice<S: Sample>(&self, place: Place, z: u32) -> Result<Slice<S>, StitchError> {
+        let (below, above, part) = match self.sections(place, z) {
+            Sections::FirstOf(sections) => return self.first_of(place, sections).await,
             Sections::Between(below, above, part) => (below, above, part),
         };
-        let below = self.first_of(level, voxels, vec![below]);
-        let above = self.first_of(level, voxels, vec![above]);
+        let below = self.first_of::<S>(place, below);
+        let above = self.first_of::<S>(place, above);
         let (mut below, above) = try_join(below, above).await?;
         let mixed = on_rayon(move || {
             below.values = match (below.values, above.values) {
@@ -237,12 +293,12 @@ impl Builder {
     }
 
     /// Stitches a plane of voxels, each from the first of these sections that has a tile there.
-    async fn first_of(
+    async fn first_of<S: Sample>(
         &self,
-        level: Level,
-        voxels: VoxelBox,
+        place: Place,
         sections: Vec<u32>,
-    ) -> Result<Slice, StitchError> {
+    ) -> Result<Slice<S>, StitchError> {
+        let (voxels, level, rules) = (place.voxels, self.level(place), self.rules);
         let size = voxels.size().truncate();
         let mut planned: Option<(Grid, Uncovered)> = None;
         let mut parts = Vec::new();
@@ -250,7 +306,7 @@ impl Builder {
         let whole = Grid::of_level(level, voxels);
         let (min, max) = whole.bounds();
         for section in sections {
-            let mut near = self.near(section, min, max).await?;
+            let mut near = self.near(section, place.channel, min, max).await?;
             if near.is_empty() {
                 continue;
             }
@@ -279,14 +335,14 @@ impl Builder {
                     Err(error) => failures.push(Failure::bounds(error, &tile, level, voxels)),
                 }
             }
-            let covered = on_rayon(move || cover(&grid, uncovered, candidates)).await;
-            let (uncovered, new_parts) = covered;
+            let covered = on_rayon(move || cover(&grid, rules.overlaps, uncovered, candidates));
+            let (uncovered, new_parts) = covered.await;
             parts.extend(new_parts);
-            if uncovered.is_empty() {
-                planned = Some((grid, uncovered));
+            let done = uncovered.is_empty();
+            planned = Some((grid, uncovered));
+            if done {
                 break;
             }
-            planned = Some((grid, uncovered));
         }
         let Some((grid, _)) = planned.filter(|_| !parts.is_empty()) else {
             return Ok(Slice {
@@ -295,30 +351,25 @@ impl Builder {
             });
         };
         let fetched = parts.into_iter().map(async |part: Part| {
-            let Candidate {
-                tile,
-                pyramid,
-                level,
-                ..
-            } = &part.candidate;
-            let wanted = part.candidate.sub_tiles(&grid, &part.segments);
-            let fetched = self
-                .tiles
-                .fetch(pyramid, tile.section, *level, wanted)
-                .await;
+            let (candidate, interpolation) = (&part.candidate, rules.interpolation);
+            let wanted = candidate.sub_tiles(&grid, &part.segments, interpolation);
+            let (pyramid, section) = (&candidate.pyramid, candidate.tile.section);
+            let fetched = self.tiles.fetch(pyramid, section, candidate.level, wanted);
+            let fetched = fetched.await;
             (part, fetched)
         });
         let fetched = join_all(fetched).await;
         let tiles = self.tiles.clone();
         let sampled = on_rayon(move || {
             let by = grid.size.x / size.x;
-            let mut values = vec![0; grid.size.as_usizevec2().element_product()];
+            let mut canvas = Canvas::<S>::new(grid, rules);
             for (part, fetched) in fetched {
-                let drawn = fetched.and_then(|f| draw(&tiles, &grid, &part, f, &mut values));
+                let drawn = fetched.and_then(|fetched| canvas.draw(&tiles, &part, fetched));
                 if let Err(error) = drawn {
                     failures.push(Failure::segments(error, &part.segments, by));
                 }
             }
+            let values = canvas.finish();
             let values = if by > 1 {
                 averaged(&values, size, by)
             } else {
@@ -346,16 +397,17 @@ fn sampling(tiles: &[Arc<IndexedTile>], step: DVec2) -> u32 {
 }
 
 /// Bounds of both.
-fn union(a: (u8, u8), b: (u8, u8)) -> (u8, u8) {
+fn union(a: (u16, u16), b: (u16, u16)) -> (u16, u16) {
     (a.0.min(b.0), a.1.max(b.1))
 }
 
 fn cover(
     grid: &Grid,
+    overlaps: Overlaps,
     mut uncovered: Uncovered,
     candidates: Vec<Candidate>,
 ) -> (Uncovered, Vec<Part>) {
-    let segments = uncovered.cover(grid, &candidates);
+    let segments = uncovered.cover(grid, overlaps, &candidates);
     let parts = candidates.into_iter().zip(segments);
     let parts = parts.filter(|(_, segments)| !segments.is_empty());
     let parts = parts.map(|(candidate, segments)| Part {
@@ -363,32 +415,6 @@ fn cover(
         segments,
     });
     (uncovered, parts.collect())
-}
-
-/// Decodes what a tile gives and draws it.
-fn draw(
-    tiles: &Tiles,
-    grid: &Grid,
-    part: &Part,
-    fetched: Vec<(UVec2, Fetched)>,
-    values: &mut [u8],
-) -> Result<(), StitchError> {
-    let candidate = &part.candidate;
-    let decode = |(at, fetched)| {
-        let (section, level) = (candidate.tile.section, candidate.level);
-        let voxels = tiles.decode(&candidate.pyramid, section, level, at, fetched)?;
-        Ok((at, voxels))
-    };
-    let decoded: Result<Vec<_>, StitchError> = fetched.into_par_iter().map(decode).collect();
-    let patch = Patch::of_sub_tiles(candidate.size(), &decoded?);
-    let along = candidate.pixels_along_x(grid);
-    for segment in &part.segments {
-        let row = segment.y as usize * grid.size.x as usize;
-        let out = &mut values[row + segment.start as usize..row + segment.end as usize];
-        let pixel = candidate.pixel(grid, segment.start, segment.y);
-        patch.sample(pixel, along, out);
-    }
-    Ok(())
 }
 
 /// Runs on rayon's threads, unless nobody waits for it any more.

@@ -10,7 +10,23 @@ use saccade_core::levels::Level;
 use saccade_core::voxel_box::VoxelBox;
 
 use super::index::IndexedTile;
+use super::resample::Interpolation;
 use super::tiles::Pyramid;
+
+/// Of the tiles at a sample, those take part whose pixels are at most so many times as large as the
+/// smallest ones there \[003 §3.3\].
+const ALIKE: f64 = 1.5;
+
+/// What is seen where tiles overlap.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Overlaps {
+    /// The tile whose centre is nearest.
+    #[default]
+    NearestCentre,
+    /// The mean of all tiles, weighted by how far each reaches from there: by the distance to the
+    /// nearest of its edges. Seams fade, which suits light microscopy; what does not match doubles.
+    Blend,
+}
 
 /// Samples on a section, `size` of them, of which the first is number `first` of the whole level.
 #[derive(Clone, Copy, Debug)]
@@ -93,8 +109,26 @@ impl Candidate {
         self.tile.tile_from_section.along_x() * grid.step.x / f64::from(1_u32 << self.level)
     }
 
+    /// Whether it is seen where another is that is there as well: its pixels are not much larger.
+    pub(super) fn is_fine_beside(&self, other: &Self) -> bool {
+        let (own, others) = (self.tile.pixels_per_voxel(), other.tile.pixels_per_voxel());
+        others <= own * (ALIKE * ALIKE)
+    }
+
+    /// How much it counts for in a mean of tiles at a position \[pixels of its level 0\].
+    pub(super) fn weight(&self, position: DVec2) -> f64 {
+        // At its edge, where it may be alone, still something.
+        const LEAST: f64 = 1e-3;
+        let to_edge = position.min(self.tile.size.as_dvec2() - position);
+        to_edge.min_element().max(LEAST) / self.tile.pixels_per_voxel().sqrt()
+    }
+
     /// Bounds of the values that it may give to samples, and whether it covers all of them.
-    pub(super) fn range(&self, grid: &Grid) -> (Option<(u8, u8)>, bool) {
+    pub(super) fn range(
+        &self,
+        grid: &Grid,
+        interpolation: Interpolation,
+    ) -> (Option<(u16, u16)>, bool) {
         let UVec2 { x, y } = grid.size - 1;
         let corners = [(0, 0), (x, 0), (0, y), (x, y)];
         let inside = |(x, y)| self.tile.contains(self.tile.position(grid.point(x, y)));
@@ -106,7 +140,9 @@ impl Candidate {
         if min.cmpgt(size + 1.0).any() || max.cmplt(DVec2::splat(-1.0)).any() {
             return (None, false);
         }
-        let (range, blanks) = self.pyramid.range(self.level, min, max);
+        let reach = interpolation.reach();
+        let (range, blanks) = self.pyramid.range(self.level, min, max, reach);
+        let range = range.map(|range| interpolation.bounds(range));
         (range, !blanks && corners.into_iter().all(inside))
     }
 
@@ -147,13 +183,19 @@ impl Candidate {
     }
 
     /// The sub-tiles that the samples of these segments touch.
-    pub(super) fn sub_tiles(&self, grid: &Grid, segments: &[Segment]) -> Vec<UVec2> {
+    pub(super) fn sub_tiles(
+        &self,
+        grid: &Grid,
+        segments: &[Segment],
+        interpolation: Interpolation,
+    ) -> Vec<UVec2> {
         const PIECE: u32 = 32;
         // More than positions are off by in fixed point.
         const MARGIN: f64 = 1e-3;
         let size = self.size();
         let last = DVec2::new(f64::from(size.width - 1), f64::from(size.height - 1));
         let columns = size.sub_tiles.x;
+        let reach = interpolation.reach();
         let mut wanted = vec![false; (columns * size.sub_tiles.y) as usize];
         for segment in segments {
             let mut start = segment.start;
@@ -161,9 +203,9 @@ impl Candidate {
                 let end = (start + PIECE).min(segment.end);
                 let a = self.pixel(grid, start, segment.y);
                 let b = self.pixel(grid, end - 1, segment.y);
-                // Between the centres of two pixels in each direction.
-                let low = (a.min(b) - (0.5 + MARGIN)).floor();
-                let high = (a.max(b) - (0.5 - MARGIN)).floor() + 1.0;
+                // Between the centres of pixels in each direction.
+                let low = (a.min(b) - (0.5 + MARGIN)).floor() - (reach - 1.0);
+                let high = (a.max(b) - (0.5 - MARGIN)).floor() + reach;
                 let low = low.clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
                 let high = high.clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
                 for y in low.y..=high.y {
@@ -243,8 +285,14 @@ impl Uncovered {
         })
     }
 
-    /// Gives what is left to the candidates that cover it; returns each one's segments.
-    pub(super) fn cover(&mut self, grid: &Grid, candidates: &[Candidate]) -> Vec<Vec<Segment>> {
+    /// Gives what is left to the candidates that cover it; returns each one's segments. Blended ones
+    /// have samples in common.
+    pub(super) fn cover(
+        &mut self,
+        grid: &Grid,
+        overlaps: Overlaps,
+        candidates: &[Candidate],
+    ) -> Vec<Vec<Segment>> {
         let mut segments = vec![Vec::new(); candidates.len()];
         let mut pieces = Vec::new();
         let mut ends = Vec::new();
@@ -262,13 +310,16 @@ impl Uncovered {
                     }
                 }
             }
-            winners(grid, y, candidates, &mut pieces, &mut ends, |n, won| {
-                take(left, won, |part| {
-                    segments[n].push(Segment {
-                        y,
-                        start: part.start,
-                        end: part.end,
-                    });
+            let rules = (grid, overlaps, candidates);
+            winners(rules, y, &mut pieces, &mut ends, |seen, run| {
+                take(left, run, |part| {
+                    for n in seen {
+                        segments[*n].push(Segment {
+                            y,
+                            start: part.start,
+                            end: part.end,
+                        });
+                    }
                 });
             });
         }
@@ -295,20 +346,19 @@ fn take(left: &mut Vec<Range<u32>>, won: Range<u32>, mut part: impl FnMut(Range<
     }
 }
 
-/// Calls `won` with each run of samples and the candidate that is seen there.
+/// Calls `won` with the candidates that are seen in each run of samples.
 fn winners(
-    grid: &Grid,
+    (grid, overlaps, candidates): (&Grid, Overlaps, &[Candidate]),
     y: u32,
-    candidates: &[Candidate],
     pieces: &mut [(usize, Range<u32>)],
     ends: &mut Vec<u32>,
-    mut won: impl FnMut(usize, Range<u32>),
+    mut won: impl FnMut(&[usize], Range<u32>),
 ) {
     pieces.sort_unstable_by_key(|(n, piece)| (piece.start, *n));
     let apart = pieces.windows(2).all(|p| p[0].1.end <= p[1].1.start);
     if apart {
         for (n, piece) in pieces {
-            won(*n, piece.clone());
+            won(&[*n], piece.clone());
         }
         return;
     }
@@ -316,6 +366,9 @@ fn winners(
     ends.clear();
     for (n, (a, piece)) in pieces.iter().enumerate() {
         ends.extend([piece.start, piece.end]);
+        if overlaps == Overlaps::Blend {
+            continue;
+        }
         let later = pieces[n + 1..].iter();
         for (b, other) in later.take_while(|(_, other)| other.start < piece.end) {
             let both = other.start..piece.end.min(other.end);
@@ -342,13 +395,26 @@ fn winners(
     }
     ends.sort_unstable();
     ends.dedup();
+    let mut seen = Vec::new();
     for run in ends.windows(2) {
         let (start, end) = (run[0], run[1]);
         let here = pieces.iter().filter(|(_, p)| p.contains(&start));
-        let point = grid.point(start, y);
-        let best = here.min_by(|a, b| candidates[a.0].compare(&candidates[b.0], point));
-        if let Some((n, _)) = best {
-            won(*n, start..end);
+        seen.clear();
+        seen.extend(here.map(|(n, _)| *n));
+        let pixels = |n: &&usize| candidates[**n].tile.pixels_per_voxel();
+        let finest = seen.iter().max_by(|a, b| pixels(a).total_cmp(&pixels(b)));
+        if let Some(&finest) = finest {
+            seen.retain(|n| candidates[*n].is_fine_beside(&candidates[finest]));
+        }
+        if overlaps == Overlaps::NearestCentre {
+            let point = grid.point(start, y);
+            let nearest = |a: &&usize, b: &&usize| candidates[**a].compare(&candidates[**b], point);
+            let first = seen.iter().min_by(nearest).copied();
+            seen.clear();
+            seen.extend(first);
+        }
+        if !seen.is_empty() {
+            won(&seen, start..end);
         }
     }
 }

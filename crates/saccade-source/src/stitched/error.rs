@@ -1,5 +1,6 @@
 use saccade_archive::catalog::CatalogError;
 use saccade_archive::pyramid::PyramidError;
+use saccade_core::volume::Dtype;
 
 /// Why a block, or the part of it that a tile covers, could not be built.
 #[derive(Debug, thiserror::Error)]
@@ -32,6 +33,20 @@ pub enum StitchError {
         /// The file.
         name: String,
     },
+    /// A tile's pyramid has values of another type than its volume.
+    #[error(
+        "the pyramid is of {} bits, its volume of {}; append the tile's record to its acquisition once \
+         more, and ingest makes it anew: {name}",
+        8 * got.bytes(), 8 * expected.bytes()
+    )]
+    Dtype {
+        /// Of the volume.
+        expected: Dtype,
+        /// Of the pyramid.
+        got: Dtype,
+        /// The file.
+        name: String,
+    },
     /// A tile's pyramid is shorter than its index says.
     #[error(
         "the pyramid ends early; append the tile's record to its acquisition \
@@ -41,9 +56,6 @@ pub enum StitchError {
         /// The file.
         name: String,
     },
-    /// Only volumes of one 8-bit channel can be stitched.
-    #[error("only volumes of one 8-bit channel can be stitched")]
-    Kind,
     /// The runtime that does the work has ended, or building panicked.
     #[error("building stopped")]
     Stopped {
@@ -59,7 +71,9 @@ impl StitchError {
             Self::Catalog { source } => source.is_transient(),
             // A file that is not there may be on its way; the catalog named it.
             Self::Tile { source, .. } => matches!(source, PyramidError::Storage { .. }),
-            Self::Size { .. } | Self::Cut { .. } | Self::Kind | Self::Stopped { .. } => false,
+            Self::Size { .. } | Self::Dtype { .. } | Self::Cut { .. } | Self::Stopped { .. } => {
+                false
+            }
         }
     }
 }

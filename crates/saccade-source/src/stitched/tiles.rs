@@ -14,6 +14,7 @@ use quick_cache::sync::Cache;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::pyramid::{PyramidIndex, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_archive::storage::Storage;
+use saccade_core::volume::Dtype;
 
 /// Bytes that are rather read and thrown away than left out by a further read.
 const GAP: u64 = 16 << 10;
@@ -49,25 +50,37 @@ impl Pyramid {
 
     /// Smallest and largest value of the sub-tiles that a rectangle \[pixels of the level\] touches,
     /// blank ones left out, and whether there are such; `None` if all are blank.
-    pub(super) fn range(&self, level: u32, min: DVec2, max: DVec2) -> (Option<(u8, u8)>, bool) {
+    /// The interpolation reaches over `reach` pixels.
+    pub(super) fn range(
+        &self,
+        level: u32,
+        min: DVec2,
+        max: DVec2,
+        reach: f64,
+    ) -> (Option<(u16, u16)>, bool) {
         let size = self.index.levels()[level as usize];
         let last = UVec2::new(size.width - 1, size.height - 1).as_dvec2();
-        // Between the centres of two pixels in each direction.
-        let low = (min - 0.51).clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
-        let high = (max + 0.51).clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
-        let mut range: Option<(u8, u8)> = None;
+        // Between the centres of pixels in each direction.
+        let reach = reach - 0.49;
+        let low = (min - reach).clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
+        let high = (max + reach).clamp(DVec2::ZERO, last).as_uvec2() / SUB_TILE_EDGE;
+        let mut range: Option<(u16, u16)> = None;
         let mut blanks = false;
         for y in low.y..=high.y {
             for x in low.x..=high.x {
                 match self.index.sub_tile(level as usize, x, y) {
                     Some(entry) if !entry.is_blank() => {
-                        let (min, max) = (byte(entry.min), byte(entry.max));
+                        let (min, max) = (entry.min, entry.max);
                         let (least, most) = range.unwrap_or((min, max));
                         range = Some((least.min(min), most.max(max)));
                     }
                     _ => blanks = true,
                 }
             }
+        }
+        if blanks {
+            // Beside a blank sub-tile, values fall off to 0.
+            range = range.map(|(_, most)| (0, most));
         }
         (range, blanks)
     }
@@ -92,7 +105,7 @@ pub(super) struct SubTileKey {
 
 /// A sub-tile as it was read or, better, as it was decoded before or need not be.
 pub(super) enum Fetched {
-    Constant(u8),
+    Constant(u16),
     Encoded(Bytes),
     Decoded(Bytes),
 }
@@ -115,6 +128,8 @@ impl Weighter<Box<str>, Arc<Pyramid>> for Bytewise {
 pub(super) struct Tiles {
     index: TileIndex,
     storage: Arc<dyn Storage>,
+    /// Of the volume.
+    dtype: Dtype,
     pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
     sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
     next_serial: AtomicU64,
@@ -125,6 +140,7 @@ impl Tiles {
     pub(super) fn new(
         archive: &VisualizationArchive,
         index: TileIndex,
+        dtype: Dtype,
         options: &StitchedOptions,
     ) -> Self {
         let items = |bytes: u64, each: usize| {
@@ -135,6 +151,7 @@ impl Tiles {
         Self {
             index,
             storage: archive.storage().clone(),
+            dtype,
             pyramids: Cache::with_weighter(
                 items(options.index_bytes, 64 << 10),
                 options.index_bytes,
@@ -165,6 +182,13 @@ impl Tiles {
             })?;
             let got = UVec2::new(index.levels()[0].width, index.levels()[0].height);
             let levels = index.levels().len();
+            if index.dtype() != self.dtype {
+                return Err(StitchError::Dtype {
+                    expected: self.dtype,
+                    got: index.dtype(),
+                    name: tile.pyramid.to_string(),
+                });
+            }
             if got != tile.size || levels <= tile.coarsest_level() as usize {
                 let (expected, name) = (tile.size, tile.pyramid.to_string());
                 return Err(StitchError::Size {
@@ -193,7 +217,7 @@ impl Tiles {
         for at in wanted {
             let entry = pyramid.index.sub_tile(level as usize, at.x, at.y);
             if let Some(entry) = entry.filter(|e| e.min == e.max && !e.is_blank()) {
-                fetched.push((at, Fetched::Constant(byte(entry.min))));
+                fetched.push((at, Fetched::Constant(entry.min)));
                 continue;
             }
             match self.sub_tiles.get(&key(pyramid, level, at)) {
@@ -222,7 +246,7 @@ impl Tiles {
         Ok(fetched)
     }
 
-    /// Decodes a fetched sub-tile, and remembers it.
+    /// Decodes a fetched sub-tile to little-endian voxels, and remembers it.
     pub(super) fn decode(
         &self,
         pyramid: &Pyramid,
@@ -232,7 +256,7 @@ impl Tiles {
         fetched: Fetched,
     ) -> Result<Bytes, StitchError> {
         let bytes = match fetched {
-            Fetched::Constant(value) => return Ok(vec![value; SUB_TILE_VOXELS].into()),
+            Fetched::Constant(value) => return Ok(self.constant(value)),
             Fetched::Decoded(voxels) => return Ok(voxels),
             Fetched::Encoded(bytes) => bytes,
         };
@@ -247,6 +271,13 @@ impl Tiles {
         Ok(voxels)
     }
 
+    fn constant(&self, value: u16) -> Bytes {
+        match self.dtype {
+            Dtype::Uint16 => value.to_le_bytes().repeat(SUB_TILE_VOXELS).into(),
+            _ => value.to_le_bytes()[..1].repeat(SUB_TILE_VOXELS).into(),
+        }
+    }
+
     /// Sub-tiles decoded so far.
     pub(super) fn decoded(&self) -> u64 {
         self.decoded.load(Ordering::Relaxed)
@@ -256,11 +287,6 @@ impl Tiles {
     pub(super) fn opened(&self) -> u64 {
         self.next_serial.load(Ordering::Relaxed)
     }
-}
-
-/// A value of an 8-bit pyramid.
-fn byte(value: u16) -> u8 {
-    u8::try_from(value).unwrap_or(u8::MAX)
 }
 
 fn key(pyramid: &Pyramid, level: u32, at: UVec2) -> SubTileKey {

@@ -130,8 +130,23 @@ impl SectionIndex {
         packed.map(|(_, tile)| tile).chain(self.recent.values())
     }
 
-    /// The tiles whose bounds touch a rectangle of the section \[level-0 voxels\], by id.
-    pub(in crate::stitched) fn near(&self, min: DVec2, max: DVec2) -> Vec<Arc<IndexedTile>> {
+    /// The tiles of a channel whose bounds touch a rectangle of the section \[level-0 voxels\], by id.
+    pub(in crate::stitched) fn near(
+        &self,
+        channel: u32,
+        min: DVec2,
+        max: DVec2,
+    ) -> Vec<Arc<IndexedTile>> {
+        self.found(min, max, |tile| tile.channel == channel)
+    }
+
+    fn found(
+        &self,
+        min: DVec2,
+        max: DVec2,
+        counts: impl Fn(&IndexedTile) -> bool,
+    ) -> Vec<Arc<IndexedTile>> {
+        let touches = |tile: &IndexedTile| counts(tile) && tile.touches(min, max);
         let mut found = Vec::new();
         self.packed.tree.touching(min, max, |number| {
             let tile = &self.packed.tiles[number];
@@ -140,20 +155,20 @@ impl SectionIndex {
                     u32::try_from(number).is_ok_and(|n| self.hidden.binary_search(&n).is_ok());
                 !self.hidden.is_empty() && number
             };
-            if tile.touches(min, max) && !hidden() {
+            if touches(tile) && !hidden() {
                 found.push(tile.clone());
             }
         });
         let recent = self.recent.values();
-        found.extend(recent.filter(|tile| tile.touches(min, max)).cloned());
+        found.extend(recent.filter(|tile| touches(tile)).cloned());
         found.sort_unstable_by_key(|tile| tile.id);
         found
     }
 
-    /// The tiles whose bounds touch a rectangle, edges included, by id.
+    /// The tiles of all channels whose bounds touch a rectangle, edges included, by id.
     pub fn touching(&self, min: SectionPoint, max: SectionPoint) -> Vec<TileId> {
-        let near = self.near(min.0, max.0);
-        near.iter().map(|tile| tile.id).collect()
+        let found = self.found(min.0, max.0, |_| true);
+        found.iter().map(|tile| tile.id).collect()
     }
 
     /// How many tiles it has.

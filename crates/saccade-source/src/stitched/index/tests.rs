@@ -211,7 +211,7 @@ async fn compare(kept: &TileIndex, catalog: &Catalog) {
             fresh.section(z).await.unwrap(),
         );
         let of = |index: &SectionIndex| {
-            let near = index.near(ALL.0.0, ALL.1.0);
+            let near = index.near(0, ALL.0.0, ALL.1.0);
             let facts = near
                 .iter()
                 .map(|t| (t.id, t.revision, t.centre, t.pyramid.clone()));

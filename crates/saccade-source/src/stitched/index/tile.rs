@@ -12,6 +12,7 @@ pub(in crate::stitched) struct IndexedTile {
     pub(in crate::stitched) id: TileId,
     pub(in crate::stitched) revision: u64,
     pub(in crate::stitched) section: u32,
+    pub(in crate::stitched) channel: u32,
     /// Pixels of level 0.
     pub(in crate::stitched) size: UVec2,
     pub(in crate::stitched) pyramid: Box<str>,
@@ -32,6 +33,7 @@ impl IndexedTile {
             id: tile.id,
             revision: tile.revision,
             section: tile.section,
+            channel: tile.channel,
             size: tile.size,
             pyramid: tile.pyramid.as_str().into(),
             tile_from_section: tile.transform.tile_from_section(),
@@ -39,6 +41,15 @@ impl IndexedTile {
             min: min.0,
             max: max.0,
         }
+    }
+
+    /// Pixels of level 0 in a level-0 voxel.
+    pub(in crate::stitched) fn pixels_per_voxel(&self) -> f64 {
+        let (x, y) = (
+            self.tile_from_section.along_x(),
+            self.tile_from_section.along_y(),
+        );
+        x.perp_dot(y).abs()
     }
 
     /// The position in the tile \[pixels of level 0\] of a position in the section.
@@ -59,11 +70,7 @@ impl IndexedTile {
     /// The pyramid level whose pixels are most like a sample of `step` level-0 voxels in size,
     /// coarser ones than there are included.
     pub(in crate::stitched) fn wanted_level(&self, step: DVec2) -> u32 {
-        let (x, y) = (
-            self.tile_from_section.along_x(),
-            self.tile_from_section.along_y(),
-        );
-        let pixels = (x.perp_dot(y) * step.x * step.y).abs().sqrt();
+        let pixels = (self.pixels_per_voxel() * step.x * step.y).abs().sqrt();
         let level = pixels.log2().round();
         // In 0..=64 for every size that is not absurd.
         #[expect(

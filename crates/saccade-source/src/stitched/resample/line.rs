@@ -47,9 +47,16 @@ impl Line {
         }
     }
 
+    /// Whether as many samples lie as pixels do.
+    fn is_straight(&self, samples: usize) -> bool {
+        let off = (self.dx - (1 << BITS)).abs().max(self.dy.abs());
+        let samples = i64::try_from(samples).unwrap_or(i64::MAX);
+        off.saturating_mul(samples) < (1 << BITS) / 10_000
+    }
+
     /// The same, where each sample lies so near to a whole pixel from the last that all have the same
     /// weights. Rounding must not move it over a pixel's edge.
-    pub(super) fn pixel_for_pixel(self) -> Self {
+    fn pixel_for_pixel(self) -> Self {
         const HALF: i64 = 1 << (BITS - 12);
         Self {
             x: (self.x + HALF) >> (BITS - 11) << (BITS - 11),
@@ -67,6 +74,16 @@ impl Line {
     /// Number of the pixel to the upper left.
     pub(super) fn pixel(&self, width: usize) -> usize {
         whole(self.y, BITS) * width + whole(self.x, BITS)
+    }
+
+    /// What follows the point \[pixels\].
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "what is cut is before the point"
+    )]
+    pub(super) fn fractions(&self) -> [f32; 2] {
+        // 24 bits are all that fit, and never round up to 1.
+        [self.x, self.y].map(|v| (v as u32 >> 8) as f32 / (1_u32 << 24) as f32)
     }
 
     /// What follows the point \[2^-16 pixels\].
@@ -135,6 +152,9 @@ fn lerp_at(top: [u8; 2], bottom: [u8; 2], right: u16, wy: u16) -> u8 {
 /// must lie between its pixels.
 pub(super) fn interpolate(values: &[u8], width: usize, mut line: Line, mut out: &mut [u8]) {
     let one = 1_i64 << BITS;
+    if line.is_straight(out.len()) {
+        line = line.pixel_for_pixel();
+    }
     let slips = (line.dx - one).abs() + line.dy.abs();
     if slips == 0 {
         return shifted(values, width, line, out);

@@ -6,8 +6,10 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures::StreamExt;
 use glam::{DVec3, UVec3};
+use saccade_archive::catalog::NewTile;
 use saccade_archive::image::GrayImage;
 use saccade_archive::pyramid::{Encoding, encode};
+use saccade_core::volume::Dtype;
 
 use super::fixture::{Fixture, chunk_of, tile};
 use super::run;
@@ -144,23 +146,35 @@ fn a_tile_that_could_not_be_read_is_tried_again() {
 }
 
 #[test]
-fn volumes_of_other_kinds_are_refused() {
+fn pyramids_of_other_types_are_refused() {
     run(async {
         let (fixture, _) = two().await;
         let mut volume = fixture.volume.clone();
-        volume.name = "two".into();
-        volume.channels.push("more".into());
-        fixture
-            .archive
-            .catalog()
-            .create_volume(&volume)
-            .await
-            .unwrap();
+        volume.name = "deep".into();
+        volume.dtype = Dtype::Uint16;
+        let catalog = fixture.archive.catalog();
+        catalog.create_volume(&volume).await.unwrap();
+        let tile = catalog.section_tiles("v", 1).await.unwrap().remove(0);
+        let new = NewTile {
+            name: tile.name,
+            section: 1,
+            channel: 0,
+            size: tile.size,
+            transform: tile.transform,
+            pyramid: tile.pyramid,
+            position: 1,
+        };
+        catalog.commit_tile("deep", &new).await.unwrap();
         let opened = crate::stitched::StitchedSource::open;
-        let error = opened(&fixture.archive, "two", StitchedOptions::default())
-            .await
-            .err();
-        let told = error.map(|e| e.source().unwrap().to_string()).unwrap();
-        assert!(told.contains("one 8-bit channel"), "{told}");
+        let source = opened(&fixture.archive, "deep", StitchedOptions::default());
+        let source = source.await.unwrap();
+        let id = ChunkId {
+            channel: 0,
+            level: 0,
+            chunk: UVec3::ZERO,
+        };
+        let error = source.read(id).await.unwrap_err();
+        let told = error.source().unwrap().to_string();
+        assert!(told.contains("of 8 bits, its volume of 16"), "{told}");
     });
 }

@@ -6,14 +6,14 @@ use std::sync::Arc;
 use glam::{DVec3, UVec2, UVec3};
 use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::{Catalog, NewTile};
-use saccade_archive::image::GrayImage;
+use saccade_archive::image::Gray;
 use saccade_archive::pyramid::{Encoding, encode};
 use saccade_archive::storage::{MemoryStorage, Storage};
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{Dtype, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::oracle::{RawTile, stitch};
+use super::oracle::{How, RawTile, stitch};
 use crate::stitched::{StitchedOptions, StitchedSource};
 use crate::{Chunk, ChunkId, VolumeSource};
 
@@ -27,8 +27,8 @@ pub(super) struct Fixture {
     _folder: tempfile::TempDir,
 }
 
-/// Whole levels, as a source or the oracle has them.
-pub(super) type Levels = Vec<Vec<u8>>;
+/// Whole levels of a channel, as a source or the oracle has them.
+pub(super) type Levels = Vec<Vec<u16>>;
 
 impl Fixture {
     pub(super) async fn new(extent: UVec3, voxel_nm: DVec3) -> Self {
@@ -36,11 +36,16 @@ impl Fixture {
     }
 
     pub(super) async fn on(storage: Arc<dyn Storage>, extent: UVec3, voxel_nm: DVec3) -> Self {
+        let volume = Volume::new("v", extent, voxel_nm).unwrap();
+        Self::of(storage, volume).await
+    }
+
+    /// Of a volume of the name `v`.
+    pub(super) async fn of(storage: Arc<dyn Storage>, volume: Volume) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let catalog = Catalog::create(&folder.path().join("catalog.sqlite"))
             .await
             .unwrap();
-        let volume = Volume::new("v", extent, voxel_nm).unwrap();
         catalog.create_volume(&volume).await.unwrap();
         Self {
             volume,
@@ -67,14 +72,23 @@ impl Fixture {
         self.changes += 1;
         tile.age = self.changes;
         let size = UVec2::new(tile.width as u32, tile.height as u32);
-        let image = GrayImage::new(size.x, size.y, tile.pixels.clone());
         let pyramid = format!("tiles/{name}-{}.tif", self.changes);
-        let bytes = encode(&image, &Encoding::Lossless).unwrap();
+        let bytes = match self.volume.dtype {
+            Dtype::Uint16 => {
+                let image = Gray::new(size.x, size.y, tile.pixels.clone());
+                encode(&image, &Encoding::Lossless).unwrap()
+            }
+            _ => {
+                let pixels = tile.pixels.iter().map(|v| *v as u8).collect::<Vec<_>>();
+                let image = Gray::new(size.x, size.y, pixels);
+                encode(&image, &Encoding::Lossless).unwrap()
+            }
+        };
         self.storage.write_durable(&pyramid, bytes).await.unwrap();
         let new = NewTile {
             name: name.into(),
             section: tile.section,
-            channel: 0,
+            channel: tile.channel,
             size,
             transform: SectionFromTile::new(tile.transform).unwrap(),
             pyramid: pyramid.clone(),
@@ -115,13 +129,22 @@ impl Fixture {
 }
 
 pub(super) fn expected(volume: &Volume, tiles: &BTreeMap<i64, RawTile>) -> Levels {
-    let levels = volume.levels.iter();
-    let levels = levels.map(|l| stitch(tiles, l.extent.to_array(), l.downsampling.to_array()));
-    levels.collect()
+    expected_as(volume, tiles, How::PLAIN)
 }
 
-/// All voxels as a source delivers them.
+pub(super) fn expected_as(volume: &Volume, tiles: &BTreeMap<i64, RawTile>, how: How) -> Levels {
+    let levels = volume.levels.iter();
+    let level = |extent: UVec3, step: DVec3| stitch(tiles, extent.to_array(), step.to_array(), how);
+    levels.map(|l| level(l.extent, l.downsampling)).collect()
+}
+
+/// All voxels of the first channel as a source delivers them.
 pub(super) async fn read_all(source: &StitchedSource) -> Levels {
+    read_channel(source, 0).await
+}
+
+/// All voxels of a channel as a source delivers them.
+pub(super) async fn read_channel(source: &StitchedSource, channel: u32) -> Levels {
     let volume = source.volume().clone();
     let mut levels = Vec::new();
     for (number, level) in (0..).zip(&volume.levels) {
@@ -129,13 +152,14 @@ pub(super) async fn read_all(source: &StitchedSource) -> Levels {
         let mut values = vec![0; extent.element_product()];
         for chunk in VoxelBox::of_size(volume.chunks(number as usize)).iter() {
             let id = ChunkId {
-                channel: 0,
+                channel,
                 level: number,
                 chunk,
             };
             let Chunk::Voxels(bytes) = source.read(id).await.unwrap() else {
                 continue;
             };
+            let chunk = numbers(&volume, &bytes);
             let voxels = id.voxels(&volume).unwrap();
             for voxel in voxels.iter() {
                 let from = (voxel - voxels.min).as_usizevec3();
@@ -143,12 +167,23 @@ pub(super) async fn read_all(source: &StitchedSource) -> Levels {
                 let from = (from.z * size.y + from.y) * size.x + from.x;
                 let to = voxel.as_usizevec3();
                 let to = (to.z * extent.y + to.y) * extent.x + to.x;
-                values[to] = bytes[from];
+                values[to] = chunk[from];
             }
         }
         levels.push(values);
     }
     levels
+}
+
+/// Values of little-endian voxels.
+pub(super) fn numbers(volume: &Volume, bytes: &[u8]) -> Vec<u16> {
+    match volume.dtype {
+        Dtype::Uint16 => bytes
+            .chunks_exact(2)
+            .map(|v| u16::from_le_bytes([v[0], v[1]]))
+            .collect(),
+        _ => bytes.iter().map(|v| u16::from(*v)).collect(),
+    }
 }
 
 /// A chunk cut out of whole levels.
@@ -163,12 +198,14 @@ pub(super) fn chunk_of(volume: &Volume, levels: &Levels, id: ChunkId) -> Vec<u8>
         let (v, extent) = (v.as_usizevec3(), extent.as_usizevec3());
         levels[id.level as usize][(v.z * extent.y + v.y) * extent.x + v.x]
     };
-    voxels.map(value).collect()
+    let bytes = volume.dtype.bytes();
+    let values = voxels.map(|offset| value(offset).to_le_bytes());
+    values.flat_map(|v| v.into_iter().take(bytes)).collect()
 }
 
 /// How two volumes differ: voxels of which one is 0 and the other is not, and the largest
 /// difference of all others.
-pub(super) fn difference(got: &Levels, want: &Levels) -> (usize, u8) {
+pub(super) fn difference(got: &Levels, want: &Levels) -> (usize, u16) {
     let pairs = || got.iter().flatten().zip(want.iter().flatten());
     assert_eq!(pairs().count(), want.iter().flatten().count());
     let coverage = pairs().filter(|(a, b)| (**a == 0) != (**b == 0)).count();
@@ -207,9 +244,13 @@ pub(super) fn tile(
     RawTile {
         width: size.0,
         height: size.1,
-        pixels: noise(size.0, size.1, seed),
+        pixels: noise(size.0, size.1, seed)
+            .into_iter()
+            .map(u16::from)
+            .collect(),
         transform: [c, s, -s, c, cx - (c * w - s * h), cy - (s * w + c * h)],
         section,
+        channel: 0,
         age: 0,
     }
 }

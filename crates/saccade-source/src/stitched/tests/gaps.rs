@@ -36,7 +36,7 @@ async fn open(fixture: &Fixture, gaps: Gaps) -> StitchedSource {
 }
 
 /// A section of level 0.
-fn plane(levels: &Levels, z: usize) -> &[u8] {
+fn plane(levels: &Levels, z: usize) -> &[u16] {
     let size = (EXTENT.x * EXTENT.y) as usize;
     &levels[0][z * size..(z + 1) * size]
 }

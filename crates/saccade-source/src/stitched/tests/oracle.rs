@@ -8,9 +8,10 @@ use std::collections::BTreeMap;
 pub(super) struct RawTile {
     pub(super) width: usize,
     pub(super) height: usize,
-    pub(super) pixels: Vec<u8>,
+    pub(super) pixels: Vec<u16>,
     pub(super) transform: [f64; 6],
     pub(super) section: u32,
+    pub(super) channel: u32,
     /// Larger for what changed later.
     pub(super) age: u64,
 }
@@ -89,7 +90,7 @@ impl Level {
         all.all(|(x, y)| self.means[y * self.w + x] < 0.5)
     }
 
-    fn sample(&self, u: f64, v: f64) -> f64 {
+    fn sample(&self, between: Between, u: f64, v: f64) -> f64 {
         let (u, v) = (u - 0.5, v - 0.5);
         let at = |x: f64, y: f64| {
             let x = x.clamp(0.0, self.w as f64 - 1.0) as usize;
@@ -97,17 +98,81 @@ impl Level {
             self.means[y * self.w + x]
         };
         let (x, y) = (u.floor(), v.floor());
-        let (s, t) = (u - x, v - y);
-        let top = at(x, y) * (1.0 - s) + at(x + 1.0, y) * s;
-        let bottom = at(x, y + 1.0) * (1.0 - s) + at(x + 1.0, y + 1.0) * s;
-        top * (1.0 - t) + bottom * t
+        let mut sum = 0.0;
+        for j in -2..4 {
+            for i in -2..4 {
+                let (px, py) = (x + f64::from(i), y + f64::from(j));
+                let weight = between.weight(u - px) * between.weight(v - py);
+                if weight != 0.0 {
+                    sum += weight * at(px, py);
+                }
+            }
+        }
+        sum
     }
+}
+
+/// What lies between pixels.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Between {
+    Box,
+    Tent,
+    /// Keys' kernel of a = -1/2.
+    Keys,
+}
+
+impl Between {
+    /// Of a pixel that lies `t` to the left.
+    fn weight(self, t: f64) -> f64 {
+        let d = t.abs();
+        match self {
+            Self::Box => f64::from((-0.5..0.5).contains(&t)),
+            Self::Tent => (1.0 - d).max(0.0),
+            Self::Keys if d <= 1.0 => 1.5 * d.powi(3) - 2.5 * d.powi(2) + 1.0,
+            Self::Keys if d < 2.0 => -0.5 * d.powi(3) + 2.5 * d.powi(2) - 4.0 * d + 2.0,
+            Self::Keys => 0.0,
+        }
+    }
+}
+
+/// How to stitch.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct How {
+    pub(super) between: Between,
+    pub(super) blend: bool,
+    pub(super) along_z: bool,
+    pub(super) channel: u32,
+    /// The largest value there is.
+    pub(super) most: u16,
+}
+
+impl How {
+    pub(super) const PLAIN: Self = Self {
+        between: Between::Tent,
+        blend: false,
+        along_z: false,
+        channel: 0,
+        most: 255,
+    };
 }
 
 /// All voxels of a level of `extent`, each the size of `down` level-0 voxels, x fastest.
 ///
-/// Tiles are given with their ids, and are all of one size.
-pub(super) fn stitch(tiles: &BTreeMap<i64, RawTile>, extent: [u32; 3], down: [f64; 3]) -> Vec<u8> {
+/// Tiles are given with their ids.
+pub(super) fn stitch(
+    tiles: &BTreeMap<i64, RawTile>,
+    extent: [u32; 3],
+    down: [f64; 3],
+    how: How,
+) -> Vec<u16> {
+    // Sections count with the tiles of all channels.
+    let mut with_tiles: Vec<u32> = tiles.values().map(|t| t.section).collect();
+    with_tiles.sort_unstable();
+    with_tiles.dedup();
+    let tiles: BTreeMap<_, _> = tiles
+        .iter()
+        .filter(|(_, t)| t.channel == how.channel)
+        .collect();
     let wanted = |t: &RawTile| {
         (t.pixels_per_voxel() * (down[0] * down[1]).sqrt())
             .log2()
@@ -117,39 +182,51 @@ pub(super) fn stitch(tiles: &BTreeMap<i64, RawTile>, extent: [u32; 3], down: [f6
     let finer = tiles.values().map(|t| wanted(t) - t.coarsest() as f64);
     let finer = finer.fold(0.0, f64::max).min(4.0);
     let by = 2_f64.powf(finer);
-    let level_of = |t: &RawTile| (wanted(t) - finer).clamp(0.0, t.coarsest() as f64) as usize;
+    let level_of = |t: &RawTile| {
+        let wanted = (t.pixels_per_voxel() * (down[0] * down[1]).sqrt() / by).log2();
+        wanted.round().clamp(0.0, t.coarsest() as f64) as usize
+    };
     let levels: BTreeMap<_, _> = tiles
         .iter()
-        .map(|(id, t)| (*id, t.level(level_of(t))))
+        .map(|(id, t)| (**id, t.level(level_of(t))))
         .collect();
     let (step_x, step_y) = (down[0] / by, down[1] / by);
 
     let of_section = |section| tiles.iter().filter(move |(_, t)| t.section == section);
-    let sample = |near: &[(&i64, &RawTile)], x: f64, y: f64| {
-        let mut best: Option<(f64, u64, i64, f64)> = None;
+    let sample = |near: &[(&&i64, &&RawTile)], x: f64, y: f64| {
+        let mut there = Vec::new();
         for (id, tile) in near {
             let (u, v) = tile.pixel(x, y);
-            let inside = u >= 0.0 && v >= 0.0 && u < tile.width as f64 && v < tile.height as f64;
-            let level = &levels[*id];
-            let (u, v) = (u / level.f, v / level.f);
-            if !inside || level.is_blank(u, v) {
+            let (w, h) = (tile.width as f64, tile.height as f64);
+            let inside = u >= 0.0 && v >= 0.0 && u < w && v < h;
+            let level = &levels[**id];
+            if !inside || level.is_blank(u / level.f, v / level.f) {
                 continue;
             }
-            let key = (tile.distance(x, y), u64::MAX - tile.age, **id);
-            if best.is_none_or(|b| key < (b.0, b.1, b.2)) {
-                best = Some((key.0, key.1, **id, level.sample(u, v)));
-            }
+            let size = 1.0 / tile.pixels_per_voxel();
+            let to_edge = u.min(v).min(w - u).min(h - v).max(1e-3) * size;
+            let key = (tile.distance(x, y), u64::MAX - tile.age, ***id);
+            let value = level.sample(how.between, u / level.f, v / level.f);
+            there.push((size, key, to_edge, value.clamp(1.0, f64::from(how.most))));
         }
-        best.map(|b| b.3.max(1.0))
+        let finest = there.iter().map(|t| t.0).fold(f64::MAX, f64::min);
+        there.retain(|t| t.0 <= 1.5 * finest);
+        if how.blend {
+            let weights: f64 = there.iter().map(|t| t.2).sum();
+            let sum: f64 = there.iter().map(|t| t.2 * t.3).sum();
+            return (!there.is_empty()).then(|| sum / weights);
+        }
+        let first = |a: &&(f64, (f64, u64, i64), _, _), b: &&(_, (f64, u64, i64), _, _)| {
+            a.1.partial_cmp(&b.1).unwrap()
+        };
+        there.iter().min_by(first).map(|t| t.3)
     };
 
     let mut voxels = Vec::new();
     for z in 0..extent[2] {
         let (low, high) = (f64::from(z) * down[2], f64::from(z + 1) * down[2]);
         let middle = (low + high) / 2.0;
-        let mut sections: Vec<u32> = tiles.values().map(|t| t.section).collect();
-        sections.sort_unstable();
-        sections.dedup();
+        let mut sections = with_tiles.clone();
         sections.retain(|s| f64::from(*s) + 0.5 >= low && f64::from(*s) + 0.5 < high);
         let off = |s: &u32| (f64::from(*s) + 0.5 - middle).abs();
         sections.sort_by(|a, b| off(a).partial_cmp(&off(b)).unwrap().then(a.cmp(b)));
@@ -159,21 +236,39 @@ pub(super) fn stitch(tiles: &BTreeMap<i64, RawTile>, extent: [u32; 3], down: [f6
             .filter(|(n, _)| *n <= 4 || n.count_ones() == 1)
             .map(|(_, s)| s)
             .collect();
-        let sections: Vec<Vec<_>> = sections.iter().map(|s| of_section(*s).collect()).collect();
+        let is_below = |s: &u32| f64::from(*s) + 0.5 <= middle;
+        let below: Vec<u32> = sections.iter().copied().filter(is_below).collect();
+        let above: Vec<u32> = sections.iter().copied().filter(|s| !is_below(s)).collect();
+        let near = |sections: &[u32]| -> Vec<Vec<_>> {
+            sections.iter().map(|s| of_section(*s).collect()).collect()
+        };
+        let voxel = |sections: &[Vec<(&&i64, &&RawTile)>], x: u32, y: u32| -> f64 {
+            let (mut sum, mut count) = (0.0, 0.0);
+            for j in 0..by as u32 {
+                for i in 0..by as u32 {
+                    let px = (f64::from(x) * by + f64::from(i) + 0.5) * step_x;
+                    let py = (f64::from(y) * by + f64::from(j) + 0.5) * step_y;
+                    let seen = sections.iter().find_map(|near| sample(near, px, py));
+                    sum += seen.unwrap_or(0.0);
+                    count += if seen.is_some() { 1.0 } else { 0.0 };
+                }
+            }
+            if count > 0.0 { sum / count } else { 0.0 }
+        };
+        let (all, lower, upper) = (near(&sections), near(&below), near(&above));
+        let mixes = how.along_z && !below.is_empty() && !above.is_empty() && off(&below[0]) > 0.0;
         for y in 0..extent[1] {
             for x in 0..extent[0] {
-                let (mut sum, mut count) = (0.0, 0.0);
-                for j in 0..by as u32 {
-                    for i in 0..by as u32 {
-                        let px = (f64::from(x) * by + f64::from(i) + 0.5) * step_x;
-                        let py = (f64::from(y) * by + f64::from(j) + 0.5) * step_y;
-                        let seen = sections.iter().find_map(|near| sample(near, px, py));
-                        sum += seen.unwrap_or(0.0);
-                        count += if seen.is_some() { 1.0 } else { 0.0 };
+                let value = if mixes {
+                    let (a, b) = (off(&below[0]), off(&above[0]));
+                    match (voxel(&lower, x, y), voxel(&upper, x, y)) {
+                        (0.0, value) | (value, 0.0) => value,
+                        (low, high) => (low * b + high * a) / (a + b),
                     }
-                }
-                let value: f64 = if count > 0.0 { sum / count } else { 0.0 };
-                voxels.push(value.round() as u8);
+                } else {
+                    voxel(&all, x, y)
+                };
+                voxels.push(value.round() as u16);
             }
         }
     }
