@@ -5,8 +5,8 @@ use saccade_core::brick::BrickId;
 /// What a delivered brick holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BrickVoxels<'a> {
-    /// The voxels with their border, as measured, x fastest:
-    /// [`BRICK_STORED_VOXELS`](saccade_core::brick::BRICK_STORED_VOXELS) values.
+    /// The voxels with their border, as measured, x fastest, little-endian:
+    /// [`BRICK_STORED_VOXELS`](saccade_core::brick::BRICK_STORED_VOXELS) values of the volume's type.
     Voxels(&'a [u8]),
     /// Nothing was acquired there.
     Empty,
@@ -35,13 +35,13 @@ pub enum DeliveryError {
         id: BrickId,
     },
     /// Too few or too many voxels.
-    #[error("{id} came with {got} voxels instead of {expected}")]
+    #[error("{id} came with {got} bytes instead of {expected}")]
     Length {
         /// As given.
         id: BrickId,
-        /// Voxels given.
+        /// Bytes given.
         got: usize,
-        /// Voxels of a brick with its border.
+        /// Bytes of a brick with its border.
         expected: usize,
     },
 }

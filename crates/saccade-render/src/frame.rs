@@ -1,37 +1,66 @@
 //! From a view to the numbers a frame's shader reads. Here f64 becomes f32.
 
 use bytemuck::Zeroable;
-use glam::{DVec3, IVec3, Vec3};
+use glam::{DVec3, IVec3, Vec2, Vec3, Vec4};
 use saccade_core::brick::{BRICK_EDGE, MAX_LEVELS};
 use saccade_core::page_table::PageTables;
-use saccade_core::transfer::{TABLE_LEN, TransferFunction};
+use saccade_core::space::Point;
 use saccade_core::volume::Volume;
 
+use crate::channel::ChannelView;
 use crate::layout::{
-    DepthUniform, FLAG_FALSE_COLORS, FLAG_JITTER, FLAG_OCTREE, FLAG_RESIDENCY, FLAG_SUBSTITUTE,
-    FrameUniform, LevelUniform, MOST_DEPTHS, OctreeUniform, TransferStorage,
+    CHANNEL_RESIDENCY, CHANNEL_VALUES, ChannelUniform, DepthUniform, FLAG_FALSE_COLORS,
+    FLAG_JITTER, FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform, HEAT_LOOKUPS, HEAT_NODES, HEAT_NONE,
+    HEAT_SAMPLES, LevelUniform, MODE_EMISSION_ABSORPTION, MODE_ISO_SURFACE, MODE_MAXIMUM,
+    MOST_CHANNELS, MOST_DEPTHS, MOST_PLANES, OctreeUniform,
 };
 use crate::memory::plan::Plan;
 use crate::octree::ResidencyOctree;
-use crate::view::View;
+use crate::transfer_table::TransferTable;
+use crate::view::{Clip, HalfSpace, Mode, Slab, View, Work};
 
 /// Anchors stay this near to the volume \[bricks, cells\]; beyond, positions need no precision.
 const ANCHOR_REACH: f64 = 1e6;
 /// More levels than this finer or coarser make no sense.
 const MOST_BIAS: f32 = 32.0;
+/// Thickness of a slab that is to have none, of the finest voxel's shortest edge: one sample.
+const THIN: f64 = 1e-3;
 
-/// Extinction beyond which nothing is seen any more, yet finite \[1/nm\].
-const OPAQUE: f64 = 1e6;
+/// A channel that is seen, and what it is stored as.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Seen<'a> {
+    pub(crate) view: &'a ChannelView,
+    pub(crate) table: &'a TransferTable,
+}
+
+/// What a frame is drawn from.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Scene<'a> {
+    pub(crate) volume: &'a Volume,
+    pub(crate) tables: &'a PageTables,
+    pub(crate) plan: &'a Plan,
+    pub(crate) octree: Option<&'a ResidencyOctree>,
+    /// To a stored value from 0 to 1, of a texel's two parts.
+    pub(crate) combine: Vec2,
+    /// Stored value that is 1.
+    pub(crate) largest: f32,
+}
 
 /// The numbers of a frame. A camera that is not finite sees nothing but background.
 pub(crate) fn frame_uniform(
     view: &View,
     lod_bias: f32,
-    volume: &Volume,
-    tables: &PageTables,
-    plan: &Plan,
-    octree: Option<&ResidencyOctree>,
+    scene: Scene<'_>,
+    seen: &[Seen<'_>],
 ) -> FrameUniform {
+    let Scene {
+        volume,
+        tables,
+        plan,
+        octree,
+        combine,
+        largest,
+    } = scene;
     let camera = &view.camera;
     let axes = camera.physical_from_eye_axes();
     let eye_nm = camera.eye().xyz;
@@ -39,7 +68,15 @@ pub(crate) fn frame_uniform(
     let tangent = (camera.fov / 2.0).to_radians().tan();
     let bias = f64::from(lod_bias.clamp(-MOST_BIAS, MOST_BIAS));
     let pixel = camera.pixel_nm(1.0, size.y) * bias.exp2();
-    let usable = axes.is_finite() && eye_nm.is_finite() && pixel.is_finite() && pixel > 0.0;
+    let [low_nm, high_nm] = view.clip.corners(volume.size_nm());
+    let planes = planes(&view.clip, eye_nm, volume.voxel_nm.min_element() * THIN);
+    let usable = !seen.is_empty()
+        && low_nm.cmplt(high_nm).all()
+        && planes.is_some()
+        && axes.is_finite()
+        && eye_nm.is_finite()
+        && pixel.is_finite()
+        && pixel > 0.0;
 
     let mut levels = [LevelUniform::zeroed(); MAX_LEVELS];
     let bricks = f64::from(BRICK_EDGE);
@@ -64,6 +101,36 @@ pub(crate) fn frame_uniform(
     let flag = |set, flag| if set { flag } else { 0 };
     let values_hold = octree.is_some_and(ResidencyOctree::values_hold);
     let residency = octree.is_some_and(ResidencyOctree::residency_is_complete);
+    let mut channels = [ChannelUniform::zeroed(); MOST_CHANNELS];
+    let last_level = u32::try_from(volume.levels.len().saturating_sub(1)).unwrap_or(0);
+    for (uniform, seen) in channels.iter_mut().zip(seen) {
+        let channel = seen.view.channel;
+        let assigned = octree.is_some_and(|octree| octree.is_assigned(channel));
+        let holds = assigned && values_hold;
+        *uniform = ChannelUniform {
+            directory_offset: channel * tables.entries_per_channel(),
+            octree_slot: octree.and_then(|o| o.slot_of(channel)).unwrap_or(0),
+            first_level: (*seen.view.levels.start()).min(last_level),
+            last_level: (*seen.view.levels.end())
+                .max(*seen.view.levels.start())
+                .min(last_level),
+            coarser: seen.view.coarser.min(last_level),
+            flags: flag(holds, CHANNEL_VALUES) | flag(holds && residency, CHANNEL_RESIDENCY),
+            table_scale: seen.table.scale,
+            table_offset: seen.table.offset,
+        };
+    }
+    let (heat, heat_full) = match view.heat {
+        None => (HEAT_NONE, 1.0),
+        Some(heat) => {
+            let of = match heat.of {
+                Work::Lookups => HEAT_LOOKUPS,
+                Work::Nodes => HEAT_NODES,
+                Work::Samples => HEAT_SAMPLES,
+            };
+            (of, heat.full.max(f32::MIN_POSITIVE))
+        }
+    };
     FrameUniform {
         forward: axes.z_axis.as_vec3(),
         pixel: single(pixel),
@@ -77,11 +144,10 @@ pub(crate) fn frame_uniform(
         flags: flag(view.substitute, FLAG_SUBSTITUTE)
             | flag(view.false_colors, FLAG_FALSE_COLORS)
             | flag(view.jitter, FLAG_JITTER)
-            | flag(values_hold, FLAG_OCTREE)
-            | flag(values_hold && residency, FLAG_RESIDENCY),
-        low_nm: (-eye_nm).as_vec3(),
+            | flag(values_hold, FLAG_OCTREE),
+        low_nm: (low_nm - eye_nm).as_vec3(),
         depth: tables.shape().depth,
-        high_nm: (volume.size_nm() - eye_nm).as_vec3(),
+        high_nm: (high_nm - eye_nm).as_vec3(),
         block_edge_log2: tables.shape().block_edge.ilog2(),
         background: view.background.into(),
         directory_entries: plan.directory,
@@ -89,8 +155,15 @@ pub(crate) fn frame_uniform(
         first_row: 0,
         size: view.size,
         usage_words: plan.usage_words(),
-        pad_0: 0,
+        channel_count: u32::try_from(seen.len()).unwrap_or(0),
+        combine,
+        largest,
+        heat,
+        heat_full,
+        pad_0: [0; 3],
         levels,
+        channels,
+        planes: planes.unwrap_or([Vec4::W; MOST_PLANES]),
         octree: octree.map_or_else(OctreeUniform::zeroed, |octree| {
             octree_uniform(octree, eye_nm, volume.voxel_nm)
         }),
@@ -129,20 +202,45 @@ fn anchored(position: DVec3, edge: f64, count: DVec3) -> (IVec3, Vec3) {
     (anchor.as_ivec3(), (position - anchor * edge).as_vec3())
 }
 
-/// The table that the shader reads: opacity as extinction, so that interpolation and step length
-/// commute, and a running count of the entries that can be seen.
-pub(crate) fn transfer_storage(transfer: &TransferFunction) -> TransferStorage {
-    let mut storage = TransferStorage::zeroed();
-    let length_nm = transfer.opacity_length_nm.max(f64::MIN_POSITIVE);
-    for (index, [r, g, b, opacity]) in transfer.table().into_iter().enumerate() {
-        let extinction = -(-f64::from(opacity)).ln_1p() / length_nm;
-        storage.colors[index] = [r, g, b, single(extinction.min(OPAQUE))];
-        let opaque = u32::from(storage.colors[index][3] > 0.0);
-        storage.opaque_before[index + 1] = storage.opaque_before[index] + opaque;
-        storage.visible_bins |= opaque << (index * 32 / TABLE_LEN);
+/// The shader's name of a mode.
+pub(crate) fn mode_of(mode: Mode) -> u32 {
+    match mode {
+        Mode::EmissionAbsorption => MODE_EMISSION_ABSORPTION,
+        Mode::Maximum => MODE_MAXIMUM,
+        Mode::IsoSurface => MODE_ISO_SURFACE,
     }
-    debug_assert!(storage.opaque_before[TABLE_LEN] <= 256, "one per entry");
-    storage
+}
+
+/// What is seen lies on the inner side of all of these, from the eye; `None` for planes that are not
+/// finite.
+fn planes(clip: &Clip, eye_nm: DVec3, thin_nm: f64) -> Option<[Vec4; MOST_PLANES]> {
+    let mut planes = [Vec4::W; MOST_PLANES];
+    let slab = clip.slab.map(|slab| faces(slab, thin_nm));
+    let faces = slab.into_iter().flatten();
+    let half_spaces = clip.half_spaces.into_iter().flatten().chain(faces);
+    for (plane, HalfSpace { point, normal }) in planes.iter_mut().zip(half_spaces) {
+        let Some(normal) = normal.try_normalize() else {
+            if normal == DVec3::ZERO {
+                continue;
+            }
+            return None;
+        };
+        let offset = normal.dot(eye_nm - point.xyz);
+        *plane = normal.as_vec3().extend(single(offset));
+        if !plane.is_finite() {
+            return None;
+        }
+    }
+    Some(planes)
+}
+
+fn faces(slab: Slab, thin_nm: f64) -> [HalfSpace; 2] {
+    let normal = slab.normal.normalize_or_zero();
+    let half = slab.thickness_nm.max(thin_nm) / 2.0;
+    [normal, -normal].map(|normal| HalfSpace {
+        point: Point::new(slab.point.xyz - normal * half),
+        normal,
+    })
 }
 
 #[expect(
@@ -175,29 +273,29 @@ mod tests {
     }
 
     #[test]
-    fn opacity_of_no_length_is_not_infinite() {
-        use saccade_core::transfer::{ColorMap, OpacityPoint};
-        let mut transfer = TransferFunction {
-            polarity: Default::default(),
-            color_map: ColorMap::Gray,
-            window: [0.0, 1.0],
-            opacity: vec![OpacityPoint {
-                value: 0.0,
-                opacity: 0.5,
-            }],
-            opacity_length_nm: 100.0,
+    fn a_slab_without_thickness_is_between_its_faces() {
+        let slab = Slab {
+            point: Point::new(DVec3::new(0.0, 0.0, 90.0)),
+            normal: DVec3::Z * 7.0,
+            thickness_nm: 0.0,
         };
-        let storage = transfer_storage(&transfer);
-        assert_eq!(
-            (storage.colors[0][3], storage.opaque_before[TABLE_LEN]),
-            (0.0, 255)
-        );
-        assert!((storage.colors[9][3] - 0.5_f32.ln().abs() / 100.0).abs() < 1e-6);
-        for length in [0.0, -1.0, f64::NAN, 1e-300] {
-            transfer.opacity_length_nm = length;
-            let colors = transfer_storage(&transfer).colors;
-            assert!(colors.iter().flatten().all(|c| c.is_finite()), "{length}");
-        }
+        let clip = Clip {
+            slab: Some(slab),
+            ..Clip::default()
+        };
+        let planes = planes(&clip, DVec3::new(5.0, 5.0, -10.0), 0.01).unwrap();
+        let inside = |z: f32| planes.iter().all(|p| p.z * z + p.w >= 0.0);
+        assert!(inside(100.0) && inside(100.004));
+        assert!(!inside(100.1) && !inside(99.9));
+        let nowhere = Slab {
+            normal: DVec3::NAN,
+            ..slab
+        };
+        let clip = Clip {
+            slab: Some(nowhere),
+            ..Clip::default()
+        };
+        assert!(super::planes(&clip, DVec3::ZERO, 0.01).is_some_and(|p| p == [Vec4::W; 6]));
     }
 
     #[test]

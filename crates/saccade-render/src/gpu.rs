@@ -71,7 +71,7 @@ impl Gpu {
 
     /// What to ask an adapter for, so that caches can be as large as it allows.
     ///
-    /// No feature is asked for: everything here is portable to browsers.
+    /// One feature is asked for, where it is offered: textures of 16 bit. All else is portable to browsers.
     pub fn device_descriptor(adapter: &wgpu::Adapter) -> wgpu::DeviceDescriptor<'static> {
         let has = adapter.limits();
         let required_limits = wgpu::Limits {
@@ -84,6 +84,7 @@ impl Gpu {
         wgpu::DeviceDescriptor {
             label: Some("saccade"),
             required_limits,
+            required_features: adapter.features() & wgpu::Features::TEXTURE_FORMAT_16BIT_NORM,
             ..Default::default()
         }
     }

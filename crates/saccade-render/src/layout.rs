@@ -1,7 +1,7 @@
 //! What Rust and WGSL must agree on. The test below compares the two, without a GPU.
 
 use bytemuck::{Pod, Zeroable};
-use glam::{IVec3, UVec2, UVec3, Vec3};
+use glam::{IVec3, UVec2, UVec3, Vec2, Vec3, Vec4};
 use saccade_core::brick::MAX_LEVELS;
 use saccade_core::transfer::TABLE_LEN;
 
@@ -17,8 +17,31 @@ pub(crate) const FLAG_JITTER: u32 = 4;
 
 /// Skip and substitute by the residency octree.
 pub(crate) const FLAG_OCTREE: u32 = 8;
-/// The octree notes every resident brick: levels it does not name are not there.
-pub(crate) const FLAG_RESIDENCY: u32 = 16;
+
+/// Channels that can be seen at once.
+pub(crate) const MOST_CHANNELS: usize = 16;
+/// Planes that cut the volume, those of a slab included.
+pub(crate) const MOST_PLANES: usize = 6;
+/// What the octree says of a channel's values holds.
+pub(crate) const CHANNEL_VALUES: u32 = 1;
+/// The octree notes every resident brick of the channel: levels it does not name are not there.
+pub(crate) const CHANNEL_RESIDENCY: u32 = 2;
+
+/// How samples become a picture: integrated light.
+pub(crate) const MODE_EMISSION_ABSORPTION: u32 = 0;
+/// The largest value.
+pub(crate) const MODE_MAXIMUM: u32 = 1;
+/// The first surface.
+pub(crate) const MODE_ISO_SURFACE: u32 = 2;
+
+/// The volume is drawn.
+pub(crate) const HEAT_NONE: u32 = 0;
+/// Page table walks are drawn.
+pub(crate) const HEAT_LOOKUPS: u32 = 1;
+/// Nodes visited are drawn.
+pub(crate) const HEAT_NODES: u32 = 2;
+/// Samples taken are drawn.
+pub(crate) const HEAT_SAMPLES: u32 = 3;
 
 /// Words at the front of a report.
 pub(crate) const COUNTERS: u32 = 16;
@@ -39,6 +62,13 @@ pub(crate) const FINEST_LEVEL: u32 = 6;
 
 /// Nodes of the residency octree visited.
 pub(crate) const COUNT_NODES: u32 = 7;
+
+/// Rays that met the volume.
+pub(crate) const COUNT_RAYS: u32 = 8;
+/// Page table walks of the ray that had the most.
+pub(crate) const MOST_LOOKUPS: u32 = 9;
+/// `u32::MAX` less the page table walks of the ray that had the fewest.
+pub(crate) const FEWEST_LOOKUPS: u32 = 10;
 
 /// Depths that a residency octree can have, its root's included.
 pub(crate) const MOST_DEPTHS: usize = 24;
@@ -103,6 +133,20 @@ pub(crate) struct OctreeUniform {
     pub(crate) depths: [DepthUniform; MOST_DEPTHS],
 }
 
+/// A channel that is seen. Fields are explained in `lib/frame.wgsl`.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub(crate) struct ChannelUniform {
+    pub(crate) directory_offset: u32,
+    pub(crate) octree_slot: u32,
+    pub(crate) first_level: u32,
+    pub(crate) last_level: u32,
+    pub(crate) coarser: u32,
+    pub(crate) flags: u32,
+    pub(crate) table_scale: f32,
+    pub(crate) table_offset: f32,
+}
+
 /// One frame. Fields are explained in `lib/frame.wgsl`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
@@ -123,12 +167,19 @@ pub(crate) struct FrameUniform {
     pub(crate) first_row: u32,
     pub(crate) size: UVec2,
     pub(crate) usage_words: u32,
-    pub(crate) pad_0: u32,
+    pub(crate) channel_count: u32,
+    pub(crate) combine: Vec2,
+    pub(crate) largest: f32,
+    pub(crate) heat: u32,
+    pub(crate) heat_full: f32,
+    pub(crate) pad_0: [u32; 3],
     pub(crate) levels: [LevelUniform; MAX_LEVELS],
     pub(crate) octree: OctreeUniform,
+    pub(crate) channels: [ChannelUniform; MOST_CHANNELS],
+    pub(crate) planes: [Vec4; MOST_PLANES],
 }
 
-/// Colours by stored value.
+/// Colours of a channel by stored value.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct TransferStorage {
@@ -136,13 +187,31 @@ pub(crate) struct TransferStorage {
     pub(crate) colors: [[f32; 4]; TABLE_LEN],
     /// Entries below an index that are not transparent.
     pub(crate) opaque_before: [u32; TABLE_LEN + 1],
-    /// A bit per eight entries: whether any is not transparent.
+    /// A bit per bin of stored values: whether any is not transparent.
     pub(crate) visible_bins: u32,
-    pub(crate) pad_0: [u32; 2],
+    /// Stored value of the surface, `[0, 1]`.
+    pub(crate) iso: f32,
+    pub(crate) pad_0: u32,
 }
 
-/// The ray-caster's source: shared files first, the entry point last.
-pub(crate) const RAY_CAST: &str = concat!(
+/// The ray-caster's source for up to `slots` channels and a mode, one of `MODE_`.
+///
+/// Both are constants, so that compilers leave out what is not needed.
+pub(crate) fn ray_cast(slots: u32, mode: u32) -> String {
+    // With one channel there is nothing to count.
+    let count = if slots == 1 {
+        "1u"
+    } else {
+        "frame.channel_count"
+    };
+    format!(
+        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\n\
+         fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}"
+    )
+}
+
+/// Shared files first, the entry point last. Without the constants of [`ray_cast`].
+const RAY_CAST: &str = concat!(
     include_str!("shaders/lib/constants.wgsl"),
     include_str!("shaders/lib/frame.wgsl"),
     include_str!("shaders/lib/ray.wgsl"),
@@ -159,27 +228,38 @@ mod tests {
     use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE};
     use std::mem::{offset_of, size_of};
 
+    const VARIANTS: [(u32, u32); 5] = [
+        (1, MODE_EMISSION_ABSORPTION),
+        (1, MODE_MAXIMUM),
+        (1, MODE_ISO_SURFACE),
+        (2, MODE_EMISSION_ABSORPTION),
+        (16, MODE_ISO_SURFACE),
+    ];
+
+    fn parsed(source: &str) -> naga::Module {
+        naga::front::wgsl::parse_str(source)
+            .unwrap_or_else(|e| panic!("{}", e.emit_to_string(source)))
+    }
+
     fn module() -> naga::Module {
-        naga::front::wgsl::parse_str(RAY_CAST)
-            .unwrap_or_else(|e| panic!("{}", e.emit_to_string(RAY_CAST)))
+        parsed(&ray_cast(1, MODE_EMISSION_ABSORPTION))
     }
 
     #[test]
     fn every_shader_is_valid_without_any_optional_feature() {
-        let mut validator = naga::valid::Validator::new(
-            naga::valid::ValidationFlags::all(),
-            naga::valid::Capabilities::empty(),
-        );
-        let module = module();
-        validator
-            .validate(&module)
-            .unwrap_or_else(|e| panic!("{}", e.emit_to_string(RAY_CAST)));
-        let entries: Vec<_> = module
-            .entry_points
-            .iter()
-            .map(|e| e.name.as_str())
-            .collect();
-        assert_eq!(entries, ["main"]);
+        for (slots, mode) in VARIANTS {
+            let mut validator = naga::valid::Validator::new(
+                naga::valid::ValidationFlags::all(),
+                naga::valid::Capabilities::empty(),
+            );
+            let source = ray_cast(slots, mode);
+            let module = parsed(&source);
+            validator
+                .validate(&module)
+                .unwrap_or_else(|e| panic!("{}", e.emit_to_string(&source)));
+            let entries = module.entry_points.iter().map(|e| e.name.as_str());
+            assert_eq!(entries.collect::<Vec<_>>(), ["main"]);
+        }
     }
 
     #[test]
@@ -238,7 +318,20 @@ mod tests {
             ("FLAG_FALSE_COLORS", FLAG_FALSE_COLORS),
             ("FLAG_JITTER", FLAG_JITTER),
             ("FLAG_OCTREE", FLAG_OCTREE),
-            ("FLAG_RESIDENCY", FLAG_RESIDENCY),
+            ("MOST_CHANNELS", u32::try_from(MOST_CHANNELS).unwrap()),
+            ("MOST_PLANES", u32::try_from(MOST_PLANES).unwrap()),
+            ("CHANNEL_VALUES", CHANNEL_VALUES),
+            ("CHANNEL_RESIDENCY", CHANNEL_RESIDENCY),
+            ("MODE_EMISSION_ABSORPTION", MODE_EMISSION_ABSORPTION),
+            ("MODE_MAXIMUM", MODE_MAXIMUM),
+            ("MODE_ISO_SURFACE", MODE_ISO_SURFACE),
+            ("HEAT_NONE", HEAT_NONE),
+            ("HEAT_LOOKUPS", HEAT_LOOKUPS),
+            ("HEAT_NODES", HEAT_NODES),
+            ("HEAT_SAMPLES", HEAT_SAMPLES),
+            ("COUNT_RAYS", COUNT_RAYS),
+            ("MOST_LOOKUPS", MOST_LOOKUPS),
+            ("FEWEST_LOOKUPS", FEWEST_LOOKUPS),
             ("MOST_DEPTHS", u32::try_from(MOST_DEPTHS).unwrap()),
             ("SIBLINGS", SIBLINGS),
             ("NODE_CHILDREN", NODE_CHILDREN),
@@ -325,8 +418,15 @@ mod tests {
             first_row,
             size,
             usage_words,
+            channel_count,
+            combine,
+            largest,
+            heat,
+            heat_full,
             levels,
-            octree
+            octree,
+            channels,
+            planes
         );
         assert_eq!(wgsl_struct(&module, "Frame"), frame);
         let depth = rust_struct!(DepthUniform, shift, residency, bits);
@@ -341,7 +441,19 @@ mod tests {
             depths
         );
         assert_eq!(wgsl_struct(&module, "Octree"), octree);
-        let transfer = rust_struct!(TransferStorage, colors, opaque_before, visible_bins);
+        let channel = rust_struct!(
+            ChannelUniform,
+            directory_offset,
+            octree_slot,
+            first_level,
+            last_level,
+            coarser,
+            flags,
+            table_scale,
+            table_offset
+        );
+        assert_eq!(wgsl_struct(&module, "Channel"), channel);
+        let transfer = rust_struct!(TransferStorage, colors, opaque_before, visible_bins, iso);
         assert_eq!(wgsl_struct(&module, "Transfer"), transfer);
     }
 }

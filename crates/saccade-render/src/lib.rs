@@ -45,15 +45,23 @@
 //!   by ratio. A voxel's size is the root of the area of its shadow along the ray: for voxels of
 //!   4 x 4 x 40 nm, 4 nm seen from the front and 13 nm from the side. A pixel's size is
 //!   [`Camera::pixel_nm`](saccade_core::camera::Camera::pixel_nm) at that depth, times 2 to the power of the level-of-detail bias.
-//! - A **segment** is half a voxel of the wanted level long, measured along the ray in voxels of
+//! - A **channel** is drawn at that level, or at the nearest of those it may be drawn at
+//!   ([`ChannelView::levels`]), all at the same places: the finest of their levels says how far apart.
+//! - A **segment** is half a voxel of the finest level drawn long, measured along the ray in voxels of
 //!   that level, the last one shorter. After 8192 segments it doubles, so that every ray ends.
 //! - It is **sampled** once, in its middle (or elsewhere in it, with [`View::jitter`]): trilinear
 //!   within one level. Outside the volume is what bricks carry there, as a rule nothing.
 //! - Its **colour** comes from the table of the transfer function, between two entries by their
-//!   linear light and extinction; its **opacity** is `1 - exp(-extinction * length)`. Pictures do
+//!   linear light and extinction. Channels add up: extinctions are summed, and so is light, by extinction. Its **opacity** is `1 - exp(-extinction * length)`. Pictures do
 //!   not depend on the step.
 //! - Segments are composited front to back in linear light over [`View::background`], until less
 //!   than 1/4096 of the light is left, and encoded as sRGB.
+//! - With [`Mode::Maximum`] the largest value along the ray gives the colour of its channel, and the light
+//!   of channels is added; with [`Mode::IsoSurface`] the ray ends where a channel's value, linear
+//!   between samples, passes its bound, lit by how much the surface faces the eye.
+//! - **Clipping** ([`Clip`]) cuts the ray before it is cut into segments.
+//! - 16-bit voxels are **exact**: in textures of 16 bit, or as two parts of 8 bit that are joined before they
+//!   are interpolated.
 //! - What is **missing** is drawn from the nearest coarser level that is there, else from up to two
 //!   levels finer, else not at all. Where no good substitute is there, a brick two levels coarser
 //!   and the coarsest one are asked for first: they come soon and show much.
@@ -63,16 +71,17 @@
 //!
 //! # Failure
 //!
-//! No adapter, an impossible ceiling, a volume that is not 8 bit: typed errors when things are
+//! No adapter, an impossible ceiling, a channel twice: typed errors when things are
 //! made. A missing brick is not an error. Errors of the device while drawing are logged and end
 //! nothing; a lost device is told by [`Gpu::is_lost`], and everything made with it is to be made
 //! again. A camera that is not finite sees background.
 //!
 //! # What it does not do
 //!
-//! It fetches nothing, opens no window, starts no thread and reads no clock. One channel, 8 bit,
-//! one-dimensional transfer functions.
+//! It fetches nothing, opens no window, starts no thread and reads no clock. Labels are not drawn yet;
+//! transfer functions have one dimension.
 
+mod channel;
 mod delivery;
 mod frame;
 mod gpu;
@@ -87,14 +96,16 @@ mod renderer;
 mod report;
 mod resources;
 mod stored_brick;
+mod transfer_table;
 mod view;
 
+pub use channel::{ChannelError, ChannelView};
 pub use delivery::{BrickVoxels, Delivery, DeliveryError};
 pub use gpu::{Gpu, GpuError};
 pub use image::{Image, ReadError};
 pub use options::{RendererError, RendererOptions, Traversal};
 pub use renderer::Renderer;
 pub use report::{Fidelity, FrameReport, MemoryUse, Statistics};
-pub use view::View;
+pub use view::{Clip, HalfSpace, Heat, Mode, Slab, View, Work};
 /// The GPU interface, so that all rooms use one version.
 pub use wgpu;

@@ -2,7 +2,6 @@
 
 use glam::UVec3;
 use saccade_core::page_table::{PageTableError, PageTableShape};
-use saccade_core::volume::Dtype;
 
 /// How rays find what is not worth sampling, and what may stand in for what is missing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -27,6 +26,9 @@ pub struct RendererOptions {
     /// Size of the residency octree's smallest boxes \[level-0 voxels\], rounded to powers of
     /// two; `None` chooses by the shape of voxels. At coarser levels boxes are as many voxels *of that level*.
     pub octree_cell: Option<UVec3>,
+    /// Keep 16-bit voxels as two 8-bit parts even where the device has a format for them: the same
+    /// picture, as devices without one draw it. For comparison.
+    pub split_16_bit: bool,
     /// Submissions a frame is cut into. More than one keeps slow drivers from giving up on a
     /// frame that takes seconds, and lets windows breathe between.
     pub bands: u32,
@@ -39,6 +41,7 @@ impl Default for RendererOptions {
             page_table_shape: None,
             traversal: Traversal::default(),
             octree_cell: None,
+            split_16_bit: false,
             bands: 1,
         }
     }
@@ -48,12 +51,6 @@ impl Default for RendererOptions {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RendererError {
-    /// A value type that is not drawn yet.
-    #[error("volumes of {dtype:?} voxels cannot be drawn; convert them to 8 bit")]
-    Dtype {
-        /// As the volume has it.
-        dtype: Dtype,
-    },
     /// The volume does not fit the page tables.
     #[error("the volume cannot be addressed")]
     PageTable {

@@ -1,24 +1,60 @@
 //! The compiled ray-caster. Compiling takes a while, so all renderers of a device share one.
 
-use crate::layout::{FrameUniform, RAY_CAST};
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+
+use crate::layout::{FrameUniform, ray_cast};
 
 /// Format of the picture: portable for storage, read as it is by windows.
 pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
 
-/// The pipeline and the order of its bindings.
+/// What a pipeline is made for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct Variant {
+    /// Channels it can draw.
+    slots: u32,
+    /// One of `layout::MODE_`.
+    mode: u32,
+}
+
+impl Variant {
+    /// The variant for so many channels: they are few, so that showing one channel more rarely compiles.
+    pub(crate) fn new(channels: usize, mode: u32) -> Self {
+        let channels = u32::try_from(channels).expect("a few channels");
+        Self {
+            slots: channels.max(1).next_power_of_two(),
+            mode,
+        }
+    }
+}
+
+/// The pipelines and the order of their bindings.
 #[derive(Debug)]
 pub(crate) struct RayCaster {
-    pub(crate) pipeline: wgpu::ComputePipeline,
     pub(crate) layout: wgpu::BindGroupLayout,
+    pipelines: Mutex<HashMap<Variant, wgpu::ComputePipeline>>,
 }
 
 impl RayCaster {
     pub(crate) fn new(device: &wgpu::Device) -> Self {
-        let layout = bind_group_layout(device);
         Self {
-            pipeline: pipeline(device, &layout),
-            layout,
+            layout: bind_group_layout(device),
+            pipelines: Mutex::default(),
         }
+    }
+
+    /// The pipeline of a variant, compiled when it is first asked for.
+    pub(crate) fn pipeline(
+        &self,
+        device: &wgpu::Device,
+        variant: Variant,
+    ) -> wgpu::ComputePipeline {
+        let mut pipelines = self
+            .pipelines
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        let compile = || pipeline(device, &self.layout, variant);
+        pipelines.entry(variant).or_insert_with(compile).clone()
     }
 }
 
@@ -67,10 +103,14 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
     })
 }
 
-fn pipeline(device: &wgpu::Device, layout: &wgpu::BindGroupLayout) -> wgpu::ComputePipeline {
+fn pipeline(
+    device: &wgpu::Device,
+    layout: &wgpu::BindGroupLayout,
+    variant: Variant,
+) -> wgpu::ComputePipeline {
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
         label: Some("ray-caster"),
-        source: wgpu::ShaderSource::Wgsl(RAY_CAST.into()),
+        source: wgpu::ShaderSource::Wgsl(ray_cast(variant.slots, variant.mode).into()),
     });
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some("ray-caster"),

@@ -3,31 +3,32 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
-use glam::UVec2;
+use glam::{UVec2, Vec2};
 use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
 use saccade_core::page_table::{PageTableShape, PageTables};
-use saccade_core::transfer::{TABLE_LEN, TransferFunction};
+use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
+use crate::channel::{self, ChannelError, ChannelView};
 use crate::delivery::{BrickVoxels, Delivery, DeliveryError, Freshness};
-use crate::frame::{frame_uniform, transfer_storage};
+use crate::frame::{Scene, Seen, frame_uniform, mode_of};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
-use crate::layout::{NODE_CHANNEL, NODE_CHANNEL_WORDS};
-use crate::memory::plan::{DeviceLimits, Misfit, OctreeSize, Plan, READBACKS};
+use crate::layout::{MOST_CHANNELS, NODE_CHANNEL, NODE_CHANNEL_WORDS};
+use crate::memory::plan::{DeviceLimits, Misfit, Needs, OctreeSize, Plan, READBACKS};
 use crate::memory::pressure::Pressure;
 use crate::memory::{Frame, Placement, VirtualMemory, Want};
 use crate::octree::{BrickValues, Geometry, ResidencyOctree, Values, default_cell};
 use crate::options::{RendererError, RendererOptions, Traversal};
+use crate::ray_caster::Variant;
 use crate::readback::{self, Staging};
 use crate::report::{FrameReport, MemoryUse, RawReport};
 use crate::resources::{Picture, Resources};
 use crate::stored_brick::StoredBrick;
-use crate::view::View;
+use crate::transfer_table::{TransferTable, bins_of, largest};
+use crate::view::{Mode, View};
 
-/// Channels drawn: the first.
-const CHANNELS: u32 = 1;
 /// Storage buffers the ray-caster binds.
 const STORAGE_BUFFERS: u64 = 7;
 /// Page table blocks made for one report; the others come with the next.
@@ -47,15 +48,43 @@ pub struct Renderer {
     memory: VirtualMemory,
     octree: Option<ResidencyOctree>,
     pressure: Pressure,
-    polarity: Polarity,
-    /// Of the transfer function: entries below an index that are not transparent.
-    opaque_before: [u32; TABLE_LEN + 1],
+    /// Per channel, how its bricks are stored.
+    polarity: Vec<Polarity>,
+    /// The channels that are seen, and how.
+    channels: Vec<(ChannelView, TransferTable)>,
+    mode: Mode,
+    format: BrickFormat,
     resources: Resources,
     picture: Picture,
     readbacks: Vec<Readback>,
     view: Option<View>,
     /// Bricks of the latest report: what finds no room matters only if it is among them.
     wanted: HashSet<BrickId>,
+}
+
+/// How bricks are stored on the device.
+#[derive(Clone, Copy, Debug)]
+struct BrickFormat {
+    texture: wgpu::TextureFormat,
+    /// To a stored value from 0 to 1, of a texel's two parts.
+    combine: Vec2,
+}
+
+impl BrickFormat {
+    /// 16 bit is exact: in one part where the device can, else in two of 8 bit, which the shader joins
+    /// before it interpolates.
+    fn new(dtype: Dtype, features: wgpu::Features, split: bool) -> Self {
+        let whole = features.contains(wgpu::Features::TEXTURE_FORMAT_16BIT_NORM) && !split;
+        let (texture, combine) = match dtype {
+            Dtype::Uint16 if whole => (wgpu::TextureFormat::R16Unorm, Vec2::X),
+            Dtype::Uint16 => {
+                let parts = Vec2::new(255.0, 255.0 * 256.0) / 65_535.0;
+                (wgpu::TextureFormat::Rg8Unorm, parts)
+            }
+            _ => (wgpu::TextureFormat::R8Unorm, Vec2::X),
+        };
+        Self { texture, combine }
+    }
 }
 
 /// A report on its way back.
@@ -68,8 +97,8 @@ struct Readback {
 }
 
 impl Renderer {
-    /// Makes the caches for a volume, within the ceiling. No voxel is resident yet, and everything
-    /// is transparent until [`Self::set_transfer_function`].
+    /// Makes the caches for a volume, within the ceiling. No voxel is resident yet, and no channel is
+    /// seen until [`Self::set_channels`].
     ///
     /// # Errors
     ///
@@ -79,17 +108,14 @@ impl Renderer {
         volume: Arc<Volume>,
         options: RendererOptions,
     ) -> Result<Self, RendererError> {
-        if volume.dtype != Dtype::Uint8 {
-            return Err(RendererError::Dtype {
-                dtype: volume.dtype,
-            });
-        }
+        let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
+        let octree_slots = channels.min(u32::try_from(MOST_CHANNELS).expect("a few"));
         let shape = options.page_table_shape;
-        let shape = shape.unwrap_or_else(|| PageTableShape::for_volume(&volume.levels, CHANNELS));
+        let shape = shape.unwrap_or_else(|| PageTableShape::for_volume(&volume.levels, channels));
         if !(shape.block_edge.is_power_of_two() && (2..=3).contains(&shape.depth)) {
             return Err(RendererError::PageTableShape { shape });
         }
-        let tables = PageTables::new(&volume.levels, CHANNELS, shape)?;
+        let tables = PageTables::new(&volume.levels, channels, shape)?;
         let limits = gpu.device().limits();
         let buffers = u64::from(limits.max_storage_buffers_per_shader_stage);
         if buffers < STORAGE_BUFFERS {
@@ -113,19 +139,23 @@ impl Renderer {
         });
         let octree_size = OctreeSize {
             blocks: octree.as_ref().map_or(0, Geometry::all_blocks),
-            node_words: NODE_CHANNEL + CHANNELS * NODE_CHANNEL_WORDS,
+            node_words: NODE_CHANNEL + octree_slots * NODE_CHANNEL_WORDS,
         };
-        let plan =
-            Plan::new(&tables, octree_size, ceiling, device).map_err(|misfit| match misfit {
-                Misfit::Ceiling(needed) => RendererError::Ceiling { ceiling, needed },
-                Misfit::Buffer(needed) => RendererError::Limit {
-                    what: "bytes in a storage buffer",
-                    offered: device.buffer,
-                    needed,
-                },
-            })?;
+        let needs = Needs {
+            octree: octree_size,
+            voxel_bytes: u32::try_from(volume.dtype.bytes()).expect("a few bytes"),
+        };
+        let plan = Plan::new(&tables, needs, ceiling, device).map_err(|misfit| match misfit {
+            Misfit::Ceiling(needed) => RendererError::Ceiling { ceiling, needed },
+            Misfit::Buffer(needed) => RendererError::Limit {
+                what: "bytes in a storage buffer",
+                offered: device.buffer,
+                needed,
+            },
+        })?;
         let bands = options.bands.max(1);
-        let resources = Resources::new(gpu, &plan, bands);
+        let format = BrickFormat::new(volume.dtype, gpu.device().features(), options.split_16_bit);
+        let resources = Resources::new(gpu, &plan, format.texture, bands);
         let readback = |_| Readback {
             staging: Staging::new(gpu.device(), plan.report_bytes()),
             frame: 0,
@@ -134,18 +164,20 @@ impl Renderer {
         };
         Ok(Self {
             gpu: gpu.clone(),
-            volume,
             options: RendererOptions { bands, ..options },
             memory: VirtualMemory::new(tables, plan.blocks, plan.bricks()),
             octree: octree
-                .map(|geometry| ResidencyOctree::new(geometry, CHANNELS, plan.node_blocks)),
+                .map(|geometry| ResidencyOctree::new(geometry, octree_slots, plan.node_blocks)),
             pressure: Pressure::default(),
-            polarity: Polarity::default(),
-            opaque_before: [0; TABLE_LEN + 1],
+            polarity: vec![Polarity::default(); volume.channels.len()],
+            channels: Vec::new(),
+            mode: Mode::default(),
+            format,
             picture: resources.picture(gpu, UVec2::ONE),
             resources,
             readbacks: (0..READBACKS).map(readback).collect(),
             plan,
+            volume,
             view: None,
             wanted: HashSet::new(),
         })
@@ -161,22 +193,89 @@ impl Renderer {
         &self.gpu
     }
 
-    /// Sets colours and opacities from the next frame on.
+    /// Shows the first channel, and no other, with these colours and opacities from the next frame on.
     ///
-    /// A change of polarity drops all resident bricks, since they are stored by it.
+    /// As [`Self::set_channels`], which can do more.
     pub fn set_transfer_function(&mut self, transfer: &TransferFunction) {
-        if transfer.polarity != self.polarity {
-            self.polarity = transfer.polarity;
-            self.memory.drop_bricks();
-            self.memory.take_evicted();
-            if let Some(octree) = &mut self.octree {
-                octree.clear();
+        let view = ChannelView::new(0, transfer.clone());
+        // A volume has one channel at least.
+        let _ = self.set_channels(&[view]);
+    }
+
+    /// Sets what is seen of which channels from the next frame on: 16 of them at most, none is nothing but
+    /// background.
+    ///
+    /// Bricks are kept whether their channel is seen or not, as far as there is room. A change of
+    /// a channel's polarity drops its bricks, since they are stored by it.
+    ///
+    /// # Errors
+    ///
+    /// [`ChannelError`] for channels that cannot be seen together; nothing changes then.
+    pub fn set_channels(&mut self, views: &[ChannelView]) -> Result<(), ChannelError> {
+        channel::check(
+            views,
+            u32::try_from(self.polarity.len()).unwrap_or(u32::MAX),
+        )?;
+        for view in views {
+            let stored = &mut self.polarity[view.channel as usize];
+            if *stored != view.transfer.polarity {
+                *stored = view.transfer.polarity;
+                self.memory.drop_bricks(view.channel);
+                // The tree forgets them all at once.
+                self.memory.take_evicted();
+                if let Some(octree) = &mut self.octree {
+                    octree.forget_channel(view.channel);
+                }
             }
         }
-        let storage = transfer_storage(transfer);
-        self.resources.write_transfer(&self.gpu, &storage);
-        self.opaque_before = storage.opaque_before;
+        if let Some(octree) = &mut self.octree {
+            let dtype = self.volume.dtype;
+            let bins = views
+                .iter()
+                .map(|view| (view.channel, bins_of(view, dtype)));
+            for channel in octree.assign(&bins.collect::<Vec<_>>()) {
+                // What is resident since the channel was seen before, or by chance.
+                let mut resident: Vec<_> = self.memory.resident(channel).collect();
+                resident.sort_unstable();
+                for id in resident {
+                    octree.insert(id, None);
+                }
+            }
+        }
+        self.wanted
+            .retain(|id| views.iter().any(|view| view.channel == id.channel()));
+        let with_table = |view: &ChannelView| {
+            let table = TransferTable::new(view, self.volume.dtype, self.mode);
+            (view.clone(), table)
+        };
+        self.channels = views.iter().map(with_table).collect();
+        self.write_transfer();
         self.pressure.view_changed();
+        Ok(())
+    }
+
+    /// The channels that are seen, and how.
+    pub fn channels(&self) -> impl ExactSizeIterator<Item = &ChannelView> {
+        self.channels.iter().map(|(view, _)| view)
+    }
+
+    fn set_mode(&mut self, mode: Mode) {
+        if self.mode != mode {
+            self.mode = mode;
+            for (view, table) in &mut self.channels {
+                *table = TransferTable::new(view, self.volume.dtype, mode);
+            }
+            self.write_transfer();
+        }
+    }
+
+    fn write_transfer(&self) {
+        let tables: Vec<_> = self
+            .channels
+            .iter()
+            .map(|(_, table)| table.storage)
+            .collect();
+        self.resources.write_transfer(&self.gpu, &tables);
     }
 
     /// Records and submits one frame; never waits. Returns its number.
@@ -193,6 +292,7 @@ impl Renderer {
         if size != self.size() {
             self.picture = self.resources.picture(&self.gpu, size);
         }
+        self.set_mode(view.mode);
         let memory_bias = self.pressure.bias();
         let lod_bias = view.lod_bias + memory_bias;
         let frame = self.memory.next_frame();
@@ -204,12 +304,24 @@ impl Renderer {
             octree.advance(NODES_PER_FRAME);
             octree.flush(|first, words| resources.write_nodes(gpu, first, words));
         }
-        let tables = self.memory.tables();
-        let octree = self.octree.as_ref();
-        let uniform = frame_uniform(&view, lod_bias, &self.volume, tables, &self.plan, octree);
+        let scene = Scene {
+            volume: &self.volume,
+            tables: self.memory.tables(),
+            plan: &self.plan,
+            octree: self.octree.as_ref(),
+            combine: self.format.combine,
+            largest: f32::from(largest(self.volume.dtype)),
+        };
+        let seen = self
+            .channels
+            .iter()
+            .map(|(view, table)| Seen { view, table });
+        let uniform = frame_uniform(&view, lod_bias, scene, &seen.collect::<Vec<_>>());
+        let variant = Variant::new(self.channels.len(), mode_of(self.mode));
         let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());
         let target = readback.as_ref().map(|r| r.staging.buffer());
-        resources.draw(gpu, &self.picture, &uniform, self.options.bands, target);
+        let bands = self.options.bands;
+        resources.draw(gpu, &self.picture, (variant, &uniform), bands, target);
         if let Some(readback) = readback {
             readback.staging.begin();
             readback.frame = frame;
@@ -301,11 +413,15 @@ impl Renderer {
             return Err(DeliveryError::NoSuchBrick { id });
         }
         let stored = match voxels {
-            BrickVoxels::Voxels(raw) if raw.len() != BRICK_STORED_VOXELS => {
-                let (got, expected) = (raw.len(), BRICK_STORED_VOXELS);
-                return Err(DeliveryError::Length { id, got, expected });
+            BrickVoxels::Voxels(raw) => {
+                let dtype = self.volume.dtype;
+                let (got, expected) = (raw.len(), BRICK_STORED_VOXELS * dtype.bytes());
+                if got != expected {
+                    return Err(DeliveryError::Length { id, got, expected });
+                }
+                let polarity = self.polarity[id.channel() as usize];
+                Some(StoredBrick::new(raw, dtype, polarity))
             }
-            BrickVoxels::Voxels(raw) => Some(StoredBrick::new(raw, self.polarity)),
             BrickVoxels::Empty => None,
         };
         // Voxels of which none was acquired are as good as none.
@@ -319,8 +435,7 @@ impl Renderer {
         self.note(id, placement, stored.as_ref(), freshness);
         Ok(match (placement, stored) {
             (Placement::Slot(slot), Some(brick)) => {
-                self.resources
-                    .write_brick(&self.gpu, slot, &brick.voxels, brick.range);
+                self.resources.write_brick(&self.gpu, slot, &brick);
                 Delivery::Resident
             }
             (Placement::NoRoom, _) => {
@@ -350,10 +465,11 @@ impl Renderer {
         }
         // Values that no longer hold would hide what came instead of them.
         let current = freshness == Freshness::Current;
-        let values = current.then(|| match stored {
+        let values = match stored {
+            _ if !current => None,
             Some(brick) => octree.values_of(id, &brick.voxels),
-            None => BrickValues::uniform(Values::ZERO),
-        });
+            None => Some(BrickValues::uniform(Values::ZERO)),
+        };
         match (placement, values) {
             (Placement::Slot(_), values) => octree.insert(id, values),
             // What is known of a brick outlives it, even one that found no room.
@@ -368,17 +484,26 @@ impl Renderer {
     /// Returns whether the transfer function hides all of that: as a rule, frames from the next one
     /// on do without the brick. One that asks for it again needs it, since what is known of
     /// different levels mixes. Always `false` without a residency octree.
-    pub fn note_range(&mut self, id: BrickId, [min, max]: [u8; 2]) -> bool {
+    pub fn note_range(&mut self, id: BrickId, [min, max]: [u16; 2]) -> bool {
         let Some(octree) = self.octree.as_mut().filter(|_| self.memory.contains(id)) else {
             return false;
         };
-        // Not acquired is stored as 0, and interpolation reaches everything from there on.
-        let largest = match self.polarity {
-            Polarity::Bright => max,
-            Polarity::Dark => self.polarity.stored(min.max(1)),
+        let Some(bins) = octree.bins_of(id.channel()) else {
+            return false;
         };
-        octree.note(id, BrickValues::uniform(Values::between(0, largest)));
-        self.opaque_before[usize::from(largest) + 1] == self.opaque_before[0]
+        // Not acquired is stored as 0, and interpolation reaches everything from there on.
+        let stored = match self.polarity[id.channel() as usize] {
+            Polarity::Bright => max,
+            Polarity::Dark if max == 0 => 0,
+            Polarity::Dark => {
+                let inverted = u32::from(largest(self.volume.dtype)) + 1 - u32::from(min.max(1));
+                u16::try_from(inverted).unwrap_or(u16::MAX)
+            }
+        };
+        octree.note(id, BrickValues::uniform(Values::between(0, stored, bins)));
+        let mut seen = self.channels.iter();
+        let table = seen.find(|(view, _)| view.channel == id.channel());
+        table.is_some_and(|(_, table)| table.hides_for_good(0, stored))
     }
 
     /// Level-0 voxels changed: their bricks are wanted again at all levels.
@@ -439,6 +564,10 @@ impl Renderer {
         }
     }
 
+    fn is_seen(&self, channel: u32) -> bool {
+        self.channels().any(|view| view.channel == channel)
+    }
+
     /// Digests what a frame met: slots it used, entries it stumbled on.
     fn read_report(&mut self, frame: Frame, words: &[u32]) -> FrameReport {
         let report = RawReport::new(words, self.plan.usage_words());
@@ -450,7 +579,9 @@ impl Renderer {
                 .memory
                 .want(frame, entry, tables_made < TABLES_PER_FRAME)
             {
-                Want::Brick(id) => misses.push(id),
+                // A channel that is no longer seen wants nothing.
+                Want::Brick(id) if self.is_seen(id.channel()) => misses.push(id),
+                Want::Brick(_) => {}
                 Want::Table => tables_made += 1,
                 Want::NoRoom => self.pressure.refuse(),
                 Want::Nothing => {}

@@ -3,8 +3,9 @@
 use saccade_core::brick::{BrickId, MAX_LEVELS};
 
 use crate::layout::{
-    COUNT_LOOKUPS, COUNT_MISSES, COUNT_NODES, COUNT_SAMPLES, COUNT_STALE, COUNT_SUBSTITUTED,
-    COUNTERS, FINEST_LEVEL, MISSES, MOST_SUBSTITUTED_LEVELS,
+    COUNT_LOOKUPS, COUNT_MISSES, COUNT_NODES, COUNT_RAYS, COUNT_SAMPLES, COUNT_STALE,
+    COUNT_SUBSTITUTED, COUNTERS, FEWEST_LOOKUPS, FINEST_LEVEL, MISSES, MOST_LOOKUPS,
+    MOST_SUBSTITUTED_LEVELS,
 };
 
 /// What a frame was. Arrives some frames later; not every frame has one.
@@ -56,8 +57,12 @@ pub struct Fidelity {
 pub struct Statistics {
     /// Samples taken. Wraps at 2³².
     pub samples: u32,
+    /// Rays that met the volume.
+    pub rays: u32,
     /// Page table walks.
     pub lookups: u32,
+    /// Page table walks of the ray, of those that met the volume, that had the fewest, and the most.
+    pub lookups_per_ray: [u32; 2],
     /// Nodes of the residency octree visited.
     pub nodes: u32,
     /// Ray segments drawn from another level than wanted.
@@ -155,7 +160,15 @@ impl<'a> RawReport<'a> {
     pub(crate) fn statistics(&self, bricks_used: u32, blocks_used: u32) -> Statistics {
         Statistics {
             samples: self.counter(COUNT_SAMPLES),
+            rays: self.counter(COUNT_RAYS),
             lookups: self.counter(COUNT_LOOKUPS),
+            lookups_per_ray: match self.counter(COUNT_RAYS) {
+                0 => [0, 0],
+                _ => [
+                    u32::MAX - self.counter(FEWEST_LOOKUPS),
+                    self.counter(MOST_LOOKUPS),
+                ],
+            },
             nodes: self.counter(COUNT_NODES),
             substituted: self.counter(COUNT_SUBSTITUTED),
             bricks_used,

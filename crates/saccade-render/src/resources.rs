@@ -4,10 +4,11 @@ use glam::{UVec2, UVec3};
 use saccade_core::brick::BRICK_STORED_EDGE;
 
 use crate::gpu::Gpu;
-use crate::layout::{FrameUniform, TransferStorage, WORKGROUP};
+use crate::layout::{FrameUniform, MOST_CHANNELS, TransferStorage, WORKGROUP};
 use crate::memory::plan::Plan;
 use crate::memory::{Array, Entry};
-use crate::ray_caster::IMAGE_FORMAT;
+use crate::ray_caster::{IMAGE_FORMAT, Variant};
+use crate::stored_brick::StoredBrick;
 
 /// Caches and buffers of one volume.
 #[derive(Debug)]
@@ -22,6 +23,7 @@ pub(crate) struct Resources {
     report: wgpu::Buffer,
     transfer: wgpu::Buffer,
     bricks: wgpu::Texture,
+    brick_bytes: u32,
     brick_grid: UVec3,
     sampler: wgpu::Sampler,
 }
@@ -35,7 +37,8 @@ pub(crate) struct Picture {
 }
 
 impl Resources {
-    pub(crate) fn new(gpu: &Gpu, plan: &Plan, bands: u32) -> Self {
+    /// Caches of bricks in a format of one or two bytes a texel.
+    pub(crate) fn new(gpu: &Gpu, plan: &Plan, format: wgpu::TextureFormat, bands: u32) -> Self {
         let device = gpu.device();
         let align = device.limits().min_uniform_buffer_offset_alignment;
         let frame_stride = size_u32::<FrameUniform>().next_multiple_of(align);
@@ -56,10 +59,10 @@ impl Resources {
         let missed = words("missed", plan.mask_words(), storage | copy_dst);
         let report_usage = storage | copy_dst | wgpu::BufferUsages::COPY_SRC;
         let report = buffer(device, "report", plan.report_bytes(), report_usage);
-        let transfer_bytes = u64::from(size_u32::<TransferStorage>());
+        let transfer_bytes = (size_of::<TransferStorage>() * MOST_CHANNELS) as u64;
         let transfer = buffer(
             device,
-            "transfer function",
+            "transfer functions",
             transfer_bytes,
             storage | copy_dst,
         );
@@ -69,7 +72,7 @@ impl Resources {
             mip_level_count: 1,
             sample_count: 1,
             dimension: wgpu::TextureDimension::D3,
-            format: wgpu::TextureFormat::R8Unorm,
+            format,
             usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
             view_formats: &[],
         });
@@ -90,6 +93,7 @@ impl Resources {
             report,
             transfer,
             bricks,
+            brick_bytes: format.block_copy_size(None).unwrap_or(1),
             brick_grid: plan.brick_grid,
             sampler,
         }
@@ -134,9 +138,10 @@ impl Resources {
         }
     }
 
-    pub(crate) fn write_transfer(&self, gpu: &Gpu, transfer: &TransferStorage) {
+    /// Writes the transfer functions of the channels that are seen, in their order.
+    pub(crate) fn write_transfer(&self, gpu: &Gpu, transfer: &[TransferStorage]) {
         gpu.queue()
-            .write_buffer(&self.transfer, 0, bytemuck::bytes_of(transfer));
+            .write_buffer(&self.transfer, 0, bytemuck::cast_slice(transfer));
     }
 
     pub(crate) fn write_entries(&self, gpu: &Gpu, array: Array, first: u32, entries: &[Entry]) {
@@ -157,7 +162,7 @@ impl Resources {
     }
 
     /// Writes a brick with its border, and the range of its values.
-    pub(crate) fn write_brick(&self, gpu: &Gpu, slot: u32, voxels: &[u8], range: [u8; 2]) {
+    pub(crate) fn write_brick(&self, gpu: &Gpu, slot: u32, brick: &StoredBrick<'_>) {
         let UVec3 { x, y, .. } = self.brick_grid;
         let cell = UVec3::new(slot % x, slot / x % y, slot / (x * y));
         let at = cell * BRICK_STORED_EDGE;
@@ -173,12 +178,14 @@ impl Resources {
         };
         let rows = wgpu::TexelCopyBufferLayout {
             offset: 0,
-            bytes_per_row: Some(BRICK_STORED_EDGE),
+            bytes_per_row: Some(BRICK_STORED_EDGE * self.brick_bytes),
             rows_per_image: Some(BRICK_STORED_EDGE),
         };
         let size = extent(UVec3::splat(BRICK_STORED_EDGE));
+        let voxels = brick.voxels.bytes();
         gpu.queue().write_texture(target, voxels, rows, size);
-        let range = [range[0], range[1], 0, 0];
+        let [low, high] = brick.range.map(u32::from);
+        let range = (low | high << 16).to_le_bytes();
         gpu.queue()
             .write_buffer(&self.slot_ranges, u64::from(slot) * 4, &range);
     }
@@ -188,7 +195,7 @@ impl Resources {
         &self,
         gpu: &Gpu,
         picture: &Picture,
-        frame: &FrameUniform,
+        (variant, frame): (Variant, &FrameUniform),
         bands: u32,
         report: Option<&wgpu::Buffer>,
     ) {
@@ -205,6 +212,7 @@ impl Resources {
             gpu.queue()
                 .write_buffer(&self.frames, u64::from(at), bytemuck::bytes_of(&uniform));
         }
+        let pipeline = gpu.ray_caster().pipeline(gpu.device(), variant);
         for band in 0..bands {
             let mut encoder = gpu.device().create_command_encoder(&Default::default());
             if band == 0 {
@@ -216,7 +224,7 @@ impl Resources {
                     label: Some("ray-caster"),
                     timestamp_writes: None,
                 });
-                pass.set_pipeline(&gpu.ray_caster().pipeline);
+                pass.set_pipeline(&pipeline);
                 pass.set_bind_group(0, &picture.bind_group, &[band * self.frame_stride]);
                 let rows = per_band.min(groups.y - band * per_band);
                 pass.dispatch_workgroups(groups.x, rows, 1);

@@ -63,7 +63,7 @@ pub struct Assembler {
 }
 
 impl Assembler {
-    /// The voxels of a brick of an 8-bit volume, from its chunks as `chunk` finds them.
+    /// The voxels of a brick, of the volume's type, from its chunks as `chunk` finds them.
     ///
     /// `None` when `chunk` lacks one of [`chunks_of`]. A brick without a single measured voxel is
     /// [`BrickVoxels::Empty`]; where every chunk is empty, no memory is touched to find that out.
@@ -86,23 +86,19 @@ impl Assembler {
             return Some(BrickVoxels::Empty);
         }
         self.voxels.clear();
-        self.voxels.resize(BRICK_STORED_VOXELS, 0);
+        let bytes = volume.dtype.bytes();
+        self.voxels.resize(BRICK_STORED_VOXELS * bytes, 0);
         let stored = stored_voxels(id, level);
         for (chunk_id, voxels) in filled {
             let min = chunk_id.chunk * volume.chunk;
             let of_chunk = VoxelBox::new(min, min.saturating_add(volume.chunk));
-            copy_box(
-                id,
-                stored.intersection(of_chunk),
-                of_chunk,
-                voxels,
-                &mut self.voxels,
-            );
+            let part = stored.intersection(of_chunk);
+            copy_box(id, bytes, (part, of_chunk), voxels, &mut self.voxels);
         }
         if self.voxels.iter().all(|&v| v == 0) {
             return Some(BrickVoxels::Empty);
         }
-        replicate_ends(id, stored, &mut self.voxels);
+        replicate_ends(id, bytes, stored, &mut self.voxels);
         Some(BrickVoxels::Voxels(&self.voxels))
     }
 }
@@ -114,8 +110,14 @@ fn stored_index(id: BrickId, at: UVec3) -> [usize; 3] {
         .map(|i| i as usize)
 }
 
-/// Copies the voxels of `part` from a chunk that covers `of_chunk`.
-fn copy_box(id: BrickId, part: VoxelBox, of_chunk: VoxelBox, chunk: &[u8], brick: &mut [u8]) {
+/// Copies the voxels of `part`, each of some `bytes`, from a chunk that covers `of_chunk`.
+fn copy_box(
+    id: BrickId,
+    bytes: usize,
+    (part, of_chunk): (VoxelBox, VoxelBox),
+    chunk: &[u8],
+    brick: &mut [u8],
+) {
     if part.is_empty() {
         return;
     }
@@ -125,33 +127,37 @@ fn copy_box(id: BrickId, part: VoxelBox, of_chunk: VoxelBox, chunk: &[u8], brick
     let [row, rows, _] = of_chunk.size().to_array().map(|s| s as usize);
     for dz in 0..depth {
         for dy in 0..height {
-            let to = ((z + dz) * EDGE + y + dy) * EDGE + x;
-            let from = ((cz + dz) * rows + cy + dy) * row + cx;
+            let to = (((z + dz) * EDGE + y + dy) * EDGE + x) * bytes;
+            let from = (((cz + dz) * rows + cy + dy) * row + cx) * bytes;
+            let width = width * bytes;
             brick[to..to + width].copy_from_slice(&chunk[from..from + width]);
         }
     }
 }
 
 /// Repeats the volume's outermost voxels into the part of a brick that lies outside of it.
-fn replicate_ends(id: BrickId, stored: VoxelBox, brick: &mut [u8]) {
+fn replicate_ends(id: BrickId, bytes: usize, stored: VoxelBox, brick: &mut [u8]) {
     let [x0, y0, z0] = stored_index(id, stored.min);
     let [x1, y1, z1] = stored_index(id, stored.max - 1);
+    let row_bytes = EDGE * bytes;
+    let slice_bytes = EDGE * row_bytes;
     for z in z0..=z1 {
         for y in y0..=y1 {
-            let row = &mut brick[(z * EDGE + y) * EDGE..][..EDGE];
-            let (first, last) = (row[x0], row[x1]);
-            row[..x0].fill(first);
-            row[x1 + 1..].fill(last);
+            let row = &mut brick[(z * EDGE + y) * row_bytes..][..row_bytes];
+            for x in (0..x0).chain(x1 + 1..EDGE) {
+                let from = x.clamp(x0, x1) * bytes;
+                row.copy_within(from..from + bytes, x * bytes);
+            }
         }
-        let slice = &mut brick[z * EDGE * EDGE..][..EDGE * EDGE];
+        let slice = &mut brick[z * slice_bytes..][..slice_bytes];
         for y in (0..y0).chain(y1 + 1..EDGE) {
-            let from = y.clamp(y0, y1) * EDGE;
-            slice.copy_within(from..from + EDGE, y * EDGE);
+            let from = y.clamp(y0, y1) * row_bytes;
+            slice.copy_within(from..from + row_bytes, y * row_bytes);
         }
     }
     for z in (0..z0).chain(z1 + 1..EDGE) {
-        let from = z.clamp(z0, z1) * EDGE * EDGE;
-        brick.copy_within(from..from + EDGE * EDGE, z * EDGE * EDGE);
+        let from = z.clamp(z0, z1) * slice_bytes;
+        brick.copy_within(from..from + slice_bytes, z * slice_bytes);
     }
 }
 

@@ -401,9 +401,8 @@ impl Session {
             }
             let volume = self.renderer.volume().clone();
             let range = range_of(id, &volume, |chunk| self.requests.value_range(chunk));
-            let range = range.map(|range| [range.min, range.max].map(u8::try_from));
-            if let Some([Ok(min), Ok(max)]) = range
-                && self.renderer.note_range(id, [min, max])
+            if let Some(range) = range
+                && self.renderer.note_range(id, [range.min, range.max])
             {
                 hidden.insert(id);
             }

@@ -274,11 +274,20 @@ impl VirtualMemory {
         }
     }
 
-    /// Drops every brick. What is known to be empty stays so.
-    pub(crate) fn drop_bricks(&mut self) {
+    /// Drops every brick of a channel. What is known to be empty stays so.
+    pub(crate) fn drop_bricks(&mut self, channel: u32) {
         for slot in 0..self.bricks.capacity() {
-            self.evict_brick(slot);
+            let owner = self.bricks.owner(slot);
+            if owner.is_some_and(|brick| brick.id.channel() == channel) {
+                self.evict_brick(slot);
+            }
         }
+    }
+
+    /// The resident bricks of a channel.
+    pub(crate) fn resident(&self, channel: u32) -> impl Iterator<Item = BrickId> {
+        let ids = self.bricks.iter().map(|(_, brick)| brick.id);
+        ids.filter(move |id| id.channel() == channel)
     }
 
     /// The entry a shader ends at on the way to a brick.

@@ -29,6 +29,15 @@ pub(crate) struct OctreeSize {
     pub(crate) node_words: u32,
 }
 
+/// What bricks and tables are for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Needs {
+    /// What the residency octree has use for.
+    pub(crate) octree: OctreeSize,
+    /// Bytes of a voxel.
+    pub(crate) voxel_bytes: u32,
+}
+
 /// What the device allows.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct DeviceLimits {
@@ -50,6 +59,7 @@ pub(crate) struct Plan {
     /// Blocks of eight nodes of the residency octree.
     pub(crate) node_blocks: u32,
     node_words: u32,
+    voxel_bytes: u32,
     block_entries: u32,
 }
 
@@ -66,7 +76,10 @@ impl Plan {
     /// Fills the ceiling, or less where the volume has no use for more.
     pub(crate) fn new(
         tables: &PageTables,
-        octree: OctreeSize,
+        Needs {
+            octree,
+            voxel_bytes,
+        }: Needs,
         ceiling: u64,
         limits: DeviceLimits,
     ) -> Result<Self, Misfit> {
@@ -93,11 +106,12 @@ impl Plan {
             directory,
             node_blocks: u32::try_from(node_blocks).expect("at most 2^28"),
             node_words: octree.node_words,
+            voxel_bytes,
             block_entries,
         };
         let most_bricks = bricks_of(tables);
         let tables_only = plan(blocks, node_blocks, UVec3::ZERO);
-        let per_brick = BRICK_STORED_VOXELS as u64 + 4 + 1;
+        let per_brick = BRICK_STORED_VOXELS as u64 * u64::from(voxel_bytes) + 4 + 1;
         let room = ceiling.saturating_sub(tables_only.total_bytes()) / per_brick;
         if room < LEAST_BRICKS.min(most_bricks) {
             let smallest = plan(
@@ -149,7 +163,7 @@ impl Plan {
 
     /// The brick cache, with the value range of each slot \[bytes\].
     pub(crate) fn brick_bytes(&self) -> u64 {
-        u64::from(self.bricks()) * (BRICK_STORED_VOXELS as u64 + 4)
+        u64::from(self.bricks()) * (BRICK_STORED_VOXELS as u64 * u64::from(self.voxel_bytes) + 4)
     }
 
     /// Directory, page table cache, bitmask \[bytes\].
@@ -233,9 +247,12 @@ mod tests {
     use saccade_core::levels::halving_levels;
     use saccade_core::page_table::PageTableShape;
 
-    const OCTREE: OctreeSize = OctreeSize {
-        blocks: 1 << 40,
-        node_words: 5,
+    const NEEDS: Needs = Needs {
+        octree: OctreeSize {
+            blocks: 1 << 40,
+            node_words: 5,
+        },
+        voxel_bytes: 1,
     };
     const LIMITS: DeviceLimits = DeviceLimits {
         texture_edge: 2048,
@@ -251,8 +268,12 @@ mod tests {
     fn the_ceiling_holds_and_is_used() {
         let extents = [[32_768, 32_768, 4_096], [2_000_000, 2_000_000, 250_000]];
         for extent in extents.map(UVec3::from_array) {
-            for ceiling in [64 << 20, 256 << 20, 3_000_000_019] {
-                let plan = Plan::new(&tables(extent), OCTREE, ceiling, LIMITS).unwrap();
+            for (ceiling, voxel_bytes) in [(64 << 20, 1), (256 << 20, 2), (3_000_000_019, 1)] {
+                let needs = Needs {
+                    voxel_bytes,
+                    ..NEEDS
+                };
+                let plan = Plan::new(&tables(extent), needs, ceiling, LIMITS).unwrap();
                 let total = plan.total_bytes();
                 assert!(
                     total <= ceiling,
@@ -271,10 +292,11 @@ mod tests {
     fn small_volumes_take_what_they_need() {
         let octree = OctreeSize {
             blocks: 99,
-            ..OCTREE
+            ..NEEDS.octree
         };
+        let needs = Needs { octree, ..NEEDS };
         let tables = tables(UVec3::new(61, 47, 33));
-        let plan = Plan::new(&tables, octree, 1 << 30, LIMITS).unwrap();
+        let plan = Plan::new(&tables, needs, 1 << 30, LIMITS).unwrap();
         assert_eq!(plan.node_blocks, 99);
         assert!(plan.total_bytes() < 4 << 20, "{plan:?}");
         let all = 2 * 2 * 2 + 1;
@@ -284,16 +306,16 @@ mod tests {
     #[test]
     fn too_low_a_ceiling_names_one_that_does() {
         let tables = tables(UVec3::new(32_768, 32_768, 4_096));
-        let Err(Misfit::Ceiling(needed)) = Plan::new(&tables, OCTREE, 100_000, LIMITS) else {
+        let Err(Misfit::Ceiling(needed)) = Plan::new(&tables, NEEDS, 100_000, LIMITS) else {
             panic!("100 kB cannot hold a picture's bricks");
         };
-        assert!(Plan::new(&tables, OCTREE, needed + needed / 8, LIMITS).is_ok());
+        assert!(Plan::new(&tables, NEEDS, needed + needed / 8, LIMITS).is_ok());
         let small = DeviceLimits {
             buffer: 1000,
             ..LIMITS
         };
         assert!(matches!(
-            Plan::new(&tables, OCTREE, 1 << 30, small),
+            Plan::new(&tables, NEEDS, 1 << 30, small),
             Err(Misfit::Buffer(_))
         ));
     }

@@ -65,7 +65,6 @@ impl<T> Slots<T> {
     }
 
     /// Slots and their owners.
-    #[cfg(test)]
     pub(crate) fn iter(&self) -> impl Iterator<Item = (u32, &T)> {
         (0..)
             .zip(&self.owners)

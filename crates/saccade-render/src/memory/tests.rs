@@ -18,7 +18,7 @@ enum Op {
     Report(u32),
     Invalidate(u32),
     InvalidateBrick(u32),
-    Drop,
+    Drop(u32),
 }
 
 /// What was said last about a brick.
@@ -142,10 +142,16 @@ impl World {
                     said.since_changed = true;
                 }
             }
-            Op::Drop => {
-                self.memory.drop_bricks();
-                self.in_use.clear();
-                self.said.retain(|_, said| said.content.is_none());
+            Op::Drop(number) => {
+                let channel = self.id(number).channel();
+                self.take_evicted();
+                let resident: BTreeSet<_> = self.memory.resident(channel).collect();
+                let in_channel = self.resident.iter().filter(|id| id.channel() == channel);
+                assert_eq!(resident, in_channel.copied().collect());
+                self.memory.drop_bricks(channel);
+                self.in_use.retain(|id, _| id.channel() != channel);
+                self.said
+                    .retain(|id, said| said.content.is_none() || id.channel() != channel);
             }
         }
     }
@@ -296,7 +302,7 @@ fn op() -> impl Strategy<Value = Op> {
         3 => any::<u32>().prop_map(|n| Op::Report(n % 500)),
         1 => any::<u32>().prop_map(Op::Invalidate),
         2 => (0..500_u32).prop_map(Op::InvalidateBrick),
-        1 => Just(Op::Drop),
+        1 => any::<u32>().prop_map(Op::Drop),
     ]
 }
 
@@ -328,7 +334,7 @@ fn holds_for_a_long_time() {
                 50..75 => Op::PlaceEmpty(near),
                 75..94 => Op::Report(near),
                 94..96 => Op::Invalidate(number),
-                _ => Op::Drop,
+                _ => Op::Drop(number),
             });
             if round % 500 == 0 {
                 world.check();

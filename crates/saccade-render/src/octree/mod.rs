@@ -24,9 +24,10 @@ use saccade_core::voxel_box::VoxelBox;
 
 pub(crate) use geometry::{Geometry, default_cell};
 use nodes::{Known, Nodes, Own, ROOT};
-pub(crate) use values::{BrickValues, Values};
+pub(crate) use values::{Bins, BrickValues, Values};
 
 use crate::layout::SIBLINGS;
+use crate::stored_brick::StoredVoxels;
 
 /// Blocks that wait for [`ResidencyOctree::flush`] at most, give or take one event.
 const MOST_DIRTY: usize = 4096;
@@ -41,6 +42,8 @@ enum Event {
     },
     /// A brick is no longer resident.
     Evicted(BrickId),
+    /// A slot has another channel from here on: nothing is known of it. Next block to visit.
+    Assigned { slot: u32, block: u32 },
     /// Voxels changed: per level, what that reaches \[level-0 voxels\], and nodes yet to visit.
     Changed {
         reached: Vec<VoxelBox>,
@@ -56,15 +59,26 @@ pub(crate) struct ResidencyOctree {
     events: VecDeque<Event>,
     /// Changes of voxels among them.
     changes: usize,
+    /// The channel of each slot; a node knows of these.
+    slots: Vec<Option<Slot>>,
     resident: HashSet<BrickId>,
     /// Resident bricks that found no room in the tree.
     unrecorded: HashSet<BrickId>,
     visited: u64,
 }
 
+/// A channel that nodes know of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Slot {
+    channel: u32,
+    bins: Bins,
+    /// Events that still have to reach all nodes before what they say of the channel holds.
+    assignments: u32,
+}
+
 /// A brick on its way into the tree.
 struct Painting {
-    channel: u32,
+    slot: u32,
     level: u32,
     /// Depth at which the brick counts as resident, if it is.
     residency: Option<u32>,
@@ -81,11 +95,13 @@ struct Painting {
 }
 
 impl ResidencyOctree {
-    /// Nothing is known. Takes at most `blocks` blocks of eight nodes.
-    pub(crate) fn new(geometry: Geometry, channels: u32, blocks: u32) -> Self {
+    /// Nothing is known, of no channel yet: as many as there are `slots` can be known of at once.
+    /// Takes at most `blocks` blocks of eight nodes.
+    pub(crate) fn new(geometry: Geometry, slots: u32, blocks: u32) -> Self {
         Self {
             geometry,
-            nodes: Nodes::new(channels, blocks),
+            slots: vec![None; slots as usize],
+            nodes: Nodes::new(slots, blocks),
             events: VecDeque::new(),
             changes: 0,
             resident: HashSet::new(),
@@ -114,10 +130,71 @@ impl ResidencyOctree {
         self.visited
     }
 
-    /// What samples of a brick with these stored voxels may be, by region.
-    pub(crate) fn values_of(&self, id: BrickId, stored: &[u8]) -> BrickValues {
+    /// The slot of a channel, if it has one.
+    pub(crate) fn slot_of(&self, channel: u32) -> Option<u32> {
+        let is = |slot: &Option<Slot>| slot.is_some_and(|slot| slot.channel == channel);
+        let slot = self.slots.iter().position(is)?;
+        u32::try_from(slot).ok()
+    }
+
+    /// How a channel's values are divided among bins.
+    pub(crate) fn bins_of(&self, channel: u32) -> Option<Bins> {
+        let slot = self.slot_of(channel)?;
+        self.slots[slot as usize].map(|slot| slot.bins)
+    }
+
+    /// Lets nodes know of these channels, each with its bins, from now on. Returns those that had no slot
+    /// or other bins: nothing is known of them, and what is resident is to be [inserted](Self::insert)
+    /// again. Channels that are not named lose their slot only where another needs it.
+    ///
+    /// There are at most as many as slots.
+    pub(crate) fn assign(&mut self, channels: &[(u32, Bins)]) -> Vec<u32> {
+        let mut fresh = Vec::new();
+        for &(channel, bins) in channels {
+            let is_named = |slot: &Slot| channels.iter().any(|(c, _)| *c == slot.channel);
+            let slot = match self.slot_of(channel) {
+                Some(slot) => slot,
+                None => {
+                    let slots = || self.slots.iter();
+                    let free = slots().position(Option::is_none);
+                    let free =
+                        free.or_else(|| slots().position(|s| !s.is_some_and(|s| is_named(&s))));
+                    let Some(free) = free else { continue };
+                    u32::try_from(free).expect("a few slots")
+                }
+            };
+            let old = self.slots[slot as usize];
+            if old.is_some_and(|old| old.channel == channel && old.bins == bins) {
+                continue;
+            }
+            self.slots[slot as usize] = Some(Slot {
+                channel,
+                bins,
+                assignments: old.map_or(0, |old| old.assignments) + 1,
+            });
+            self.events.push_back(Event::Assigned { slot, block: 0 });
+            fresh.push(channel);
+        }
+        fresh
+    }
+
+    /// Whether what nodes say of the values of a channel is of that channel.
+    pub(crate) fn is_assigned(&self, channel: u32) -> bool {
+        let slot = self.slot_of(channel);
+        let slot = slot.and_then(|slot| self.slots[slot as usize]);
+        slot.is_some_and(|slot| slot.assignments == 0)
+    }
+
+    /// What samples of a brick with these stored voxels may be, by region. `None` for channels without
+    /// a slot.
+    pub(crate) fn values_of(&self, id: BrickId, stored: &StoredVoxels<'_>) -> Option<BrickValues> {
+        let bins = self.bins_of(id.channel())?;
         let [x, y, z] = self.geometry.split(id);
-        BrickValues::of_voxels(stored, [&x.gaps, &y.gaps, &z.gaps])
+        let regions: [&[_]; 3] = [&x.gaps, &y.gaps, &z.gaps];
+        Some(match stored {
+            StoredVoxels::Uint8(voxels) => BrickValues::of_voxels(voxels, bins, regions),
+            StoredVoxels::Uint16(voxels) => BrickValues::of_voxels(voxels, bins, regions),
+        })
     }
 
     /// A brick has become resident. Without values, what is known of it stays as it is.
@@ -152,13 +229,14 @@ impl ResidencyOctree {
         });
     }
 
-    /// Forgets everything, at once.
-    pub(crate) fn clear(&mut self) {
-        let (_, capacity) = self.nodes.blocks();
-        *self = Self {
-            visited: self.visited,
-            ..Self::new(self.geometry.clone(), self.nodes.channels(), capacity)
-        };
+    /// Forgets all that is known of a channel. What is resident is to be inserted again.
+    pub(crate) fn forget_channel(&mut self, channel: u32) {
+        if let Some(slot) = self.slot_of(channel) {
+            if let Some(of) = &mut self.slots[slot as usize] {
+                of.assignments += 1;
+            }
+            self.events.push_back(Event::Assigned { slot, block: 0 });
+        }
     }
 
     /// Applies queued events until about `budget` nodes were visited.
@@ -179,6 +257,23 @@ impl ResidencyOctree {
                 }
                 continue;
             }
+            if let Event::Assigned { slot, block } = event {
+                let (slot, from) = (*slot, *block);
+                match self.clear_slot(slot, from, end) {
+                    Some(next) => {
+                        if let Some(Event::Assigned { block, .. }) = self.events.front_mut() {
+                            *block = next;
+                        }
+                    }
+                    None => {
+                        self.events.pop_front();
+                        if let Some(of) = &mut self.slots[slot as usize] {
+                            of.assignments -= 1;
+                        }
+                    }
+                }
+                continue;
+            }
             match self.events.pop_front() {
                 Some(Event::Brick {
                     id,
@@ -186,9 +281,32 @@ impl ResidencyOctree {
                     resident,
                 }) => self.paint(id, values.as_ref(), resident),
                 Some(Event::Evicted(id)) => self.evict(id),
-                Some(Event::Changed { .. }) | None => {}
+                Some(Event::Changed { .. } | Event::Assigned { .. }) | None => {}
             }
         }
+    }
+
+    /// Forgets what nodes from a block on know of a slot's channel; the block to go on with.
+    fn clear_slot(&mut self, slot: u32, from: u32, end: u64) -> Option<u32> {
+        if from == 0 {
+            // What was noted of the slot's former channel, or of this one before, is forgotten.
+            let tracked: Vec<_> = self.slots.iter().flatten().map(|s| s.channel).collect();
+            let channel = self.slots[slot as usize].map(|slot| slot.channel);
+            let keep =
+                |id: &BrickId| Some(id.channel()) != channel && tracked.contains(&id.channel());
+            self.resident.retain(keep);
+            self.unrecorded.retain(keep);
+        }
+        for block in from.. {
+            if self.visited >= end || self.nodes.dirty() >= MOST_DIRTY {
+                return Some(block);
+            }
+            self.visited += u64::from(SIBLINGS);
+            if !self.nodes.clear(block, slot) {
+                return None;
+            }
+        }
+        None
     }
 
     /// Whether all events are applied.
@@ -213,6 +331,9 @@ impl ResidencyOctree {
     }
 
     fn paint(&mut self, id: BrickId, values: Option<&BrickValues>, resident: bool) {
+        let Some(slot) = self.slot_of(id.channel()) else {
+            return;
+        };
         self.nodes.tick();
         let [x, y, z] = self.geometry.split(id);
         let level = self.geometry.levels[id.level() as usize];
@@ -235,7 +356,7 @@ impl ResidencyOctree {
         };
         let regions = inside.iter().enumerate().map(region).collect();
         let painting = Painting {
-            channel: id.channel(),
+            slot,
             level: id.level(),
             residency: resident.then_some(level.residency),
             values: if uniform && aligned {
@@ -265,16 +386,16 @@ impl ResidencyOctree {
         self.visited += 1;
         self.nodes.touch(node);
         if brick.residency == Some(depth) {
-            let mut known = self.nodes.known(node, brick.channel);
+            let mut known = self.nodes.known(node, brick.slot);
             known.resident |= 1 << brick.level;
-            self.nodes.set_known(node, brick.channel, known);
+            self.nodes.set_known(node, brick.slot, known);
         }
         let mut recorded = brick.residency.is_none_or(|residency| depth >= residency);
         if depth == brick.values {
             if let Some(values) = self.painted(brick, depth, at) {
-                self.note_values(node, brick.channel, brick.level, values);
+                self.note_values(node, brick.slot, brick.level, values);
             }
-            self.pull_up(node, depth, brick.channel);
+            self.pull_up(node, depth, brick.slot);
             return recorded;
         }
         let children = self.nodes.children(node).or_else(|| {
@@ -302,9 +423,9 @@ impl ResidencyOctree {
             self.join_if_alike(node);
         } else if self.painted(brick, depth, at).is_some() {
             // No room for detail: all of the brick in one.
-            self.note_values(node, brick.channel, brick.level, brick.whole);
+            self.note_values(node, brick.slot, brick.level, brick.whole);
         }
-        self.pull_up(node, depth, brick.channel);
+        self.pull_up(node, depth, brick.slot);
         recorded
     }
 
@@ -330,8 +451,8 @@ impl ResidencyOctree {
         (node.intersection(covered) == node).then_some(values)
     }
 
-    fn note_values(&mut self, node: u32, channel: u32, level: u32, values: Values) {
-        let mut own = self.nodes.own(node, channel);
+    fn note_values(&mut self, node: u32, slot: u32, level: u32, values: Values) {
+        let mut own = self.nodes.own(node, slot);
         let bit = 1 << level;
         own.values = if own.valid & !bit == 0 {
             values
@@ -339,21 +460,21 @@ impl ResidencyOctree {
             own.values.or(values)
         };
         own.valid |= bit;
-        self.nodes.set_own(node, channel, own);
+        self.nodes.set_own(node, slot, own);
     }
 
     /// What a node says follows from what was noted at it and from what its children say.
-    fn pull_up(&mut self, node: u32, depth: u32, channel: u32) {
-        let own = self.nodes.own(node, channel);
+    fn pull_up(&mut self, node: u32, depth: u32, slot: u32) {
+        let own = self.nodes.own(node, slot);
         let mut known = Known {
             values: own.values,
             valid: own.valid,
-            resident: self.nodes.known(node, channel).resident & self.geometry.residency_at(depth),
+            resident: self.nodes.known(node, slot).resident & self.geometry.residency_at(depth),
         };
         if let Some(children) = self.nodes.children(node) {
             let (mut values, mut valid) = (Values::NONE, u32::MAX);
             for child in children..children + SIBLINGS {
-                let child = self.nodes.known(child, channel);
+                let child = self.nodes.known(child, slot);
                 values = values.or(child.values);
                 valid &= child.valid;
                 known.resident |= child.resident;
@@ -367,7 +488,7 @@ impl ResidencyOctree {
                 known.valid |= valid;
             }
         }
-        self.nodes.set_known(node, channel, known);
+        self.nodes.set_known(node, slot, known);
     }
 
     /// Children that all say the same are one node.
@@ -406,18 +527,21 @@ impl ResidencyOctree {
     }
 
     fn evict(&mut self, id: BrickId) {
+        let Some(slot) = self.slot_of(id.channel()) else {
+            return;
+        };
         self.resident.remove(&id);
         self.unrecorded.remove(&id);
         let [x, y, z] = self.geometry.split(id);
         let first = UVec3::new(x.first, y.first, z.first);
         let count = [&x, &y, &z].map(|s| u32::try_from(s.gaps.len()).expect("a few nodes"));
         let last = first + UVec3::from_array(count) - 1;
-        self.evict_node(id, (first, last), ROOT, 0, UVec3::ZERO);
+        self.evict_node((id, slot), (first, last), ROOT, 0, UVec3::ZERO);
     }
 
     fn evict_node(
         &mut self,
-        id: BrickId,
+        (id, slot): (BrickId, u32),
         (first, last): (UVec3, UVec3),
         node: u32,
         depth: u32,
@@ -427,9 +551,9 @@ impl ResidencyOctree {
         let level = self.geometry.levels[id.level() as usize];
         if depth == level.residency {
             if !self.other_overlaps(id, depth, at) {
-                let mut known = self.nodes.known(node, id.channel());
+                let mut known = self.nodes.known(node, slot);
                 known.resident &= !(1 << id.level());
-                self.nodes.set_known(node, id.channel(), known);
+                self.nodes.set_known(node, slot, known);
             }
             return;
         }
@@ -441,10 +565,16 @@ impl ResidencyOctree {
         for index in 0..SIBLINGS {
             let child = self.geometry.child(depth, at, index);
             if child.cmpge(from).all() && child.cmple(to).all() {
-                self.evict_node(id, (first, last), children + index, depth + 1, child);
+                self.evict_node(
+                    (id, slot),
+                    (first, last),
+                    children + index,
+                    depth + 1,
+                    child,
+                );
             }
         }
-        self.pull_up(node, depth, id.channel());
+        self.pull_up(node, depth, slot);
     }
 
     /// Whether another resident brick of the same level and channel overlaps a node.

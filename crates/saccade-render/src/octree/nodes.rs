@@ -195,6 +195,32 @@ impl Nodes {
         block
     }
 
+    /// Forgets what the nodes of a block know of a channel; `false` where there is no such block.
+    pub(crate) fn clear(&mut self, block: u32, channel: u32) -> bool {
+        let Some(state) = self.blocks.get(block as usize) else {
+            return false;
+        };
+        if state.in_use {
+            for node in block * SIBLINGS..(block + 1) * SIBLINGS {
+                let outside = self.own(node, channel) == Own::OUTSIDE;
+                let own = if outside { Own::OUTSIDE } else { Own::NOTHING };
+                self.set_own(node, channel, own);
+                let Own { values, valid } = own;
+                let resident = 0;
+                self.set_known(
+                    node,
+                    channel,
+                    Known {
+                        values,
+                        valid,
+                        resident,
+                    },
+                );
+            }
+        }
+        true
+    }
+
     /// Takes a node's children away. They have none themselves.
     pub(crate) fn join(&mut self, node: u32) {
         let Some(first) = self.children(node) else {

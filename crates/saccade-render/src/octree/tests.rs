@@ -22,7 +22,10 @@ enum Op {
     Note(u32),
     Evict(u32),
     Change(u32),
-    Clear,
+    /// A channel is stored another way.
+    Forget(u32),
+    /// Other channels are seen.
+    Exchange(u32),
     Advance(u32),
 }
 
@@ -51,13 +54,14 @@ impl Truth {
         ((voxel.z * extent.y + voxel.y) * extent.x + voxel.x) as usize
     }
 
-    /// Voxels outside repeat the nearest one inside.
-    fn at(&self, level: usize, voxel: [i64; 3]) -> u8 {
+    /// Voxels outside repeat the nearest one inside. Channels differ from one another.
+    fn at(&self, channel: u32, level: usize, voxel: [i64; 3]) -> u8 {
         let extent = self.volume.levels[level].extent;
         let inside = UVec3::from_array(std::array::from_fn(|axis| {
             u32::try_from(voxel[axis].clamp(0, i64::from(extent[axis]) - 1)).unwrap()
         }));
-        self.levels[level][self.flat(level, inside)]
+        let value = self.levels[level][self.flat(level, inside)];
+        value ^ u8::try_from(channel * 85).unwrap()
     }
 
     fn brick(&self, id: BrickId) -> Vec<u8> {
@@ -65,16 +69,16 @@ impl Truth {
         let cells = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE)).iter();
         let level = id.level() as usize;
         cells
-            .map(|cell| self.at(level, (low + cell.as_i64vec3()).to_array()))
+            .map(|cell| self.at(id.channel(), level, (low + cell.as_i64vec3()).to_array()))
             .collect()
     }
 
     /// Smallest and largest of the voxels that a sample at a level-0 position is made of.
-    fn around(&self, level: usize, position: DVec3) -> [u8; 2] {
+    fn around(&self, channel: u32, level: usize, position: DVec3) -> [u8; 2] {
         let corner = (position / self.volume.levels[level].downsampling - 0.5).floor();
         let values = (0..8_u32).map(|i| {
             let offset = UVec3::new(i & 1, i >> 1 & 1, i >> 2).as_i64vec3();
-            self.at(level, (corner.as_i64vec3() + offset).to_array())
+            self.at(channel, level, (corner.as_i64vec3() + offset).to_array())
         });
         values.fold([255, 0], |[low, high], v| [low.min(v), high.max(v)])
     }
@@ -134,7 +138,13 @@ struct World {
     random: u32,
 }
 
-const CHANNELS: u32 = 2;
+const CHANNELS: u32 = 3;
+/// Channels that nodes know of at once.
+const SLOTS: u32 = 2;
+
+fn bins() -> Bins {
+    Bins::of_bits(8)
+}
 
 impl World {
     fn new(truth: &Truth, cell: UVec3, blocks: u32) -> Self {
@@ -147,8 +157,10 @@ impl World {
             }
         }
         let geometry = Geometry::new(&truth.volume, cell);
+        let mut tree = ResidencyOctree::new(geometry, SLOTS, blocks);
+        tree.assign(&[(0, bins()), (1, bins())]);
         Self {
-            tree: ResidencyOctree::new(geometry, CHANNELS, blocks),
+            tree,
             truth: truth.clone(),
             ids,
             resident: BTreeSet::new(),
@@ -170,10 +182,12 @@ impl World {
         match op {
             Op::Insert(number) => {
                 let id = self.ids[number as usize % self.ids.len()];
-                let values = self.tree.values_of(id, &self.truth.brick(id));
-                self.tree.insert(id, Some(values));
+                let values = self.values(id);
+                if values.is_some() {
+                    self.known.insert(id);
+                }
+                self.tree.insert(id, values);
                 self.resident.insert(id);
-                self.known.insert(id);
             }
             Op::InsertUnknown(number) => {
                 let id = self.ids[number as usize % self.ids.len()];
@@ -186,9 +200,11 @@ impl World {
                 let [low, high] = brick
                     .iter()
                     .fold([255, 0], |[low, high], &v| [v.min(low), v.max(high)]);
-                let values = BrickValues::uniform(Values::between(low, high));
-                self.tree.note(id, values);
-                self.known.insert(id);
+                let values = Values::between(low.into(), high.into(), bins());
+                self.tree.note(id, BrickValues::uniform(values));
+                if self.tree.slot_of(id.channel()).is_some() {
+                    self.known.insert(id);
+                }
             }
             Op::Evict(number) => {
                 let count = self.resident.len().max(1);
@@ -211,14 +227,41 @@ impl World {
                     !stored.intersects(level.box_from_voxels(voxels))
                 });
             }
-            Op::Clear => {
-                self.tree.clear();
-                self.device.clear();
-                self.resident.clear();
-                self.known.clear();
+            Op::Forget(number) => {
+                let channel = number % CHANNELS;
+                self.tree.forget_channel(channel);
+                self.resident.retain(|id| id.channel() != channel);
+                self.known.retain(|id| id.channel() != channel);
+            }
+            Op::Exchange(number) => {
+                let first = number % CHANNELS;
+                let second = (first + 1 + number / 7 % (CHANNELS - 1)) % CHANNELS;
+                let wanted = [(first, bins()), (second, bins())];
+                // One may be seen alone; the other keeps its slot while nobody needs it.
+                let wanted = &wanted[..1 + (number / 5 % 2) as usize];
+                for channel in self.tree.assign(wanted) {
+                    self.known.retain(|id| id.channel() != channel);
+                    for &id in self.resident.iter().filter(|id| id.channel() == channel) {
+                        self.tree.insert(id, None);
+                    }
+                }
+                let tree = &self.tree;
+                self.known.retain(|id| tree.slot_of(id.channel()).is_some());
             }
             Op::Advance(budget) => self.tree.advance(u64::from(budget)),
         }
+    }
+
+    fn values(&self, id: BrickId) -> Option<BrickValues> {
+        let voxels = self.truth.brick(id);
+        self.tree.values_of(id, &StoredVoxels::Uint8(voxels.into()))
+    }
+
+    /// Channels of whose values nodes speak, with their slots.
+    fn assigned(&self) -> Vec<(u32, u32)> {
+        let channels = (0..CHANNELS).filter(|&channel| self.tree.is_assigned(channel));
+        let with_slot = channels.map(|c| (c, self.tree.slot_of(c).unwrap()));
+        with_slot.collect()
     }
 
     fn flush(&mut self) {
@@ -275,6 +318,7 @@ impl World {
     /// Whatever nodes claim about the values of samples is true of the voxels there are now.
     fn check_values(&mut self, samples: u32) -> u32 {
         let mut claims = 0;
+        let assigned = self.assigned();
         for _ in 0..samples {
             let extent = self.truth.volume.extent().as_dvec3();
             let unit = |n: u32| f64::from(n % 100_003) / 100_003.0;
@@ -285,17 +329,17 @@ impl World {
                     unit(self.random()),
                 );
             for level in 0..self.truth.levels.len() {
-                let [low, high] = self.truth.around(level, position);
-                for (node, depth) in self.path(position) {
-                    for channel in 0..CHANNELS {
-                        let known = self.tree.nodes.known(node, channel);
+                for &(channel, slot) in &assigned {
+                    let [low, high] = self.truth.around(channel, level, position);
+                    for (node, depth) in self.path(position) {
+                        let known = self.tree.nodes.known(node, slot);
                         if known.valid >> level & 1 == 0 {
                             continue;
                         }
                         claims += 1;
                         let holds = known.values.min <= low.into()
                             && u16::from(high) <= known.values.max
-                            && Values::between(low, high).bins & !known.values.bins == 0;
+                            && bins().between(low.into(), high.into()) & !known.values.bins == 0;
                         assert!(
                             holds,
                             "{low}..{high} at {position}, level {level}, depth {depth}: {known:?}"
@@ -325,8 +369,9 @@ impl World {
             if position.cmpge(self.truth.volume.extent().as_dvec3()).any() {
                 continue;
             }
+            let slot = self.tree.slot_of(id.channel()).unwrap();
             let known = self.path(position).into_iter().any(|(node, _)| {
-                let known = self.tree.nodes.known(node, id.channel());
+                let known = self.tree.nodes.known(node, slot);
                 known.valid >> id.level() & 1 == 1
             });
             assert!(known, "{id} is not known at {position}");
@@ -351,7 +396,7 @@ impl World {
         for (node, depth, at) in self.nodes() {
             let edge = self.tree.geometry.node_edge(depth).as_dvec3();
             let (low, high) = (at.as_dvec3() * edge, (at + 1).as_dvec3() * edge);
-            for channel in 0..CHANNELS {
+            for (channel, slot) in self.assigned() {
                 let mut want = 0;
                 for (id, (from, to)) in &boxes {
                     let overlaps = low.cmplt(*to).all() && from.cmplt(high).all();
@@ -360,7 +405,7 @@ impl World {
                         want |= 1_u32 << id.level();
                     }
                 }
-                let got = self.tree.nodes.known(node, channel).resident;
+                let got = self.tree.nodes.known(node, slot).resident;
                 assert_eq!(got, want, "depth {depth} at {at}, channel {channel}");
             }
         }
@@ -378,6 +423,11 @@ impl World {
             }
         }
         self.flush();
+        let assigned = self.assigned().len();
+        assert!(
+            (1..=SLOTS as usize).contains(&assigned),
+            "{assigned} channels"
+        );
         self.check_values(100);
         if roomy {
             self.check_nothing_is_forgotten();
@@ -398,7 +448,8 @@ fn op() -> impl Strategy<Value = Op> {
         2 => (0..200_u32).prop_map(Op::Note),
         4 => any::<u32>().prop_map(Op::Evict),
         1 => any::<u32>().prop_map(Op::Change),
-        1 => Just(Op::Clear),
+        1 => any::<u32>().prop_map(Op::Forget),
+        2 => any::<u32>().prop_map(Op::Exchange),
         6 => (0..2000_u32).prop_map(Op::Advance),
     ]
 }
@@ -441,7 +492,8 @@ fn holds_for_a_long_time() {
                 40..50 => Op::Note(number / 100),
                 50..80 => Op::Evict(number),
                 80..84 => Op::Change(number),
-                84 if number.is_multiple_of(7) => Op::Clear,
+                84 => Op::Forget(number / 100),
+                85 => Op::Exchange(number / 100),
                 _ => Op::Advance(number % 3000),
             });
             if round % 250 == 0 {
@@ -479,7 +531,8 @@ fn the_check_notices_bricks_that_are_not_there() {
 #[test]
 fn what_is_alike_is_one_node() {
     let mut world = World::new(&TRUTHS[0], UVec3::splat(8), 1 << 16);
-    let finest = world.ids.iter().filter(|id| id.level() == 0);
+    let finest = world.ids.iter();
+    let finest = finest.filter(|id| id.level() == 0 && id.channel() < SLOTS);
     let finest: Vec<_> = finest.copied().collect();
     for &id in &finest {
         let values = BrickValues::uniform(Values::ZERO);
@@ -487,15 +540,14 @@ fn what_is_alike_is_one_node() {
     }
     world.tree.advance(u64::MAX / 2);
     assert_eq!(world.tree.blocks().0, 1, "a root that knows all is enough");
-    for channel in 0..CHANNELS {
+    for channel in 0..SLOTS {
         let known = world.tree.nodes.known(ROOT, channel);
         assert_eq!((known.values, known.valid), (Values::ZERO, 1));
     }
     // One brick comes to life; the others stay known.
-    let values = world
-        .tree
-        .values_of(finest[7], &world.truth.brick(finest[7]));
-    world.tree.insert(finest[7], Some(values));
+    let values = world.values(finest[7]);
+    assert!(values.is_some());
+    world.tree.insert(finest[7], values);
     world.tree.advance(u64::MAX / 2);
     assert!(world.tree.blocks().0 > 2);
 }
@@ -510,12 +562,15 @@ fn bricks_cost_the_same_in_any_volume() {
         let geometry = Geometry::new(&volume, cell);
         let deepest = geometry.deepest();
         let mut tree = ResidencyOctree::new(geometry, 1, 1 << 16);
+        tree.assign(&[(0, bins())]);
         let stored: Vec<u8> = (0..34 * 34 * 34_u32).map(|i| (i % 251) as u8).collect();
+        let stored = StoredVoxels::Uint8(stored.into());
         for n in 0..50 {
             let at = UVec3::new(n % 4, n / 4 % 4, n / 16).min(bricks - 1);
             let id = BrickId::new(0, 0, bricks - 1 - at).unwrap();
             let values = tree.values_of(id, &stored);
-            tree.insert(id, Some(values));
+            assert!(values.is_some());
+            tree.insert(id, values);
         }
         tree.advance(u64::MAX / 2);
         (tree.visited() / 50, tree.blocks().0, deepest)

@@ -8,14 +8,14 @@ use saccade_core::brick::{BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS};
 const STORED: usize = BRICK_STORED_EDGE as usize;
 /// Gaps between stored voxels along an axis: in each, a sample lies between two voxels.
 const GAPS: usize = STORED - 1;
-/// Stored values per bin.
-const BIN_LOG2: u32 = 3;
+/// Bins.
+const BINS_LOG2: u32 = 5;
 
 /// Bounds of the stored values that a sample may have, and which of 32 bins between them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Values {
-    /// A bit per eight stored values. Interpolation between two voxels reaches all bins between
-    /// theirs, and these are set as well.
+    /// A bit per bin of stored values, see [`Bins`]. Interpolation between two voxels reaches all bins
+    /// between theirs, and these are set as well.
     pub(crate) bins: u32,
     /// Smallest.
     pub(crate) min: u16,
@@ -38,11 +38,11 @@ impl Values {
     };
 
     /// Anything from `min` to `max`.
-    pub(crate) fn between(min: u8, max: u8) -> Self {
+    pub(crate) fn between(min: u16, max: u16, bins: Bins) -> Self {
         Self {
-            bins: bins_between(min, max.max(min)),
-            min: min.into(),
-            max: max.max(min).into(),
+            bins: bins.between(min, max.max(min)),
+            min,
+            max: max.max(min),
         }
     }
 
@@ -71,9 +71,41 @@ impl Values {
     }
 }
 
-/// Bins from that of `low` to that of `high`, which is not smaller.
-fn bins_between(low: u8, high: u8) -> u32 {
-    (u32::MAX << (low >> BIN_LOG2)) & (u32::MAX >> (31 - (high >> BIN_LOG2)))
+/// How stored values are divided among 32 bins: evenly, up to a power of two. The last bin takes
+/// what is larger as well.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Bins {
+    /// Values per bin \[log2\].
+    shift: u32,
+}
+
+impl Bins {
+    /// For values of mostly `bits` bits, 5 to 16.
+    pub(crate) fn of_bits(bits: u32) -> Self {
+        Self {
+            shift: bits.clamp(BINS_LOG2, 16) - BINS_LOG2,
+        }
+    }
+
+    /// The bin of a value.
+    pub(crate) fn of(self, value: u16) -> u32 {
+        (u32::from(value) >> self.shift).min((1 << BINS_LOG2) - 1)
+    }
+
+    /// Bins from that of `low` to that of `high`, which is not smaller, as bits.
+    pub(crate) fn between(self, low: u16, high: u16) -> u32 {
+        (u32::MAX << self.of(low)) & (u32::MAX >> (31 - self.of(high)))
+    }
+
+    /// The values of a bin: first and last.
+    pub(crate) fn values(self, bin: u32) -> [u16; 2] {
+        let first = (bin << self.shift).min(u32::from(u16::MAX));
+        let last = match bin {
+            31 => u32::from(u16::MAX),
+            _ => ((bin + 1) << self.shift) - 1,
+        };
+        [first, last].map(|v| u16::try_from(v).expect("at most 16 bits"))
+    }
 }
 
 /// What the samples of a brick may be, as a whole and, where it pays, by region.
@@ -97,19 +129,22 @@ impl BrickValues {
     ///
     /// Gap `i` lies between stored voxels `i` and `i + 1`; a sample in it is interpolated from
     /// the eight voxels around.
-    pub(crate) fn of_voxels(voxels: &[u8], regions: [&[Range<usize>]; 3]) -> Self {
+    pub(crate) fn of_voxels<T>(voxels: &[T], bins: Bins, regions: [&[Range<usize>]; 3]) -> Self
+    where
+        T: Copy + Default + Ord + Into<u16>,
+    {
         debug_assert_eq!(voxels.len(), BRICK_STORED_VOXELS);
-        let low = reached(voxels, u8::min);
-        let high = reached(voxels, u8::max);
+        let low = reached(voxels, T::min);
+        let high = reached(voxels, T::max);
         let [xs, ys, zs] = regions;
         let mut values = Vec::with_capacity(xs.len() * ys.len() * zs.len());
         for z in zs {
             for y in ys {
-                values.extend(xs.iter().map(|x| of_gaps(&low, &high, [x, y, z])));
+                values.extend(xs.iter().map(|x| of_gaps(&low, &high, bins, [x, y, z])));
             }
         }
         let all = 0..GAPS;
-        let whole = of_gaps(&low, &high, [&all, &all, &all]);
+        let whole = of_gaps(&low, &high, bins, [&all, &all, &all]);
         let alike = values.iter().all(|v| *v == whole);
         Self {
             whole,
@@ -118,40 +153,48 @@ impl BrickValues {
     }
 }
 
+fn zeros<T: Copy + Default>(count: usize) -> Vec<T> {
+    vec![T::default(); count]
+}
+
 /// Per gap, x fastest, the smallest (or largest) of the eight voxels around it.
-fn reached(voxels: &[u8], of: impl Fn(u8, u8) -> u8 + Copy) -> Vec<u8> {
-    let pairs = |a: &[u8], b: &[u8], to: &mut [u8]| {
+fn reached<T: Copy + Default>(voxels: &[T], of: impl Fn(T, T) -> T + Copy) -> Vec<T> {
+    let pairs = |a: &[T], b: &[T], to: &mut [T]| {
         for ((to, a), b) in to.iter_mut().zip(a).zip(b) {
             *to = of(*a, *b);
         }
     };
-    let mut along_x = vec![0; STORED * STORED * GAPS];
+    let mut along_x = zeros(STORED * STORED * GAPS);
     for (row, to) in voxels
         .chunks_exact(STORED)
         .zip(along_x.chunks_exact_mut(GAPS))
     {
         pairs(row, &row[1..], to);
     }
-    let mut along_y = vec![0; STORED * GAPS * GAPS];
+    let mut along_y = zeros(STORED * GAPS * GAPS);
     for (slice, to) in along_x
         .chunks_exact(STORED * GAPS)
         .zip(along_y.chunks_exact_mut(GAPS * GAPS))
     {
         pairs(slice, &slice[GAPS..], to);
     }
-    let mut along_z = vec![0; GAPS * GAPS * GAPS];
+    let mut along_z = zeros(GAPS * GAPS * GAPS);
     pairs(&along_y, &along_y[GAPS * GAPS..], &mut along_z);
     along_z
 }
 
-fn of_gaps(low: &[u8], high: &[u8], [x, y, z]: [&Range<usize>; 3]) -> Values {
-    let (mut bins, mut min, mut max) = (0, u8::MAX, 0);
+fn of_gaps<T>(low: &[T], high: &[T], of: Bins, [x, y, z]: [&Range<usize>; 3]) -> Values
+where
+    T: Copy + Into<u16>,
+{
+    let (mut bins, mut min, mut max) = (0, u16::MAX, 0);
     for z in z.clone() {
         for y in y.clone() {
             let row = (z * GAPS + y) * GAPS;
             let row = row + x.start..row + x.end;
             for (&low, &high) in low[row.clone()].iter().zip(&high[row]) {
-                bins |= bins_between(low, high);
+                let (low, high) = (low.into(), high.into());
+                bins |= of.between(low, high);
                 min = min.min(low);
                 max = max.max(high);
             }
@@ -160,11 +203,7 @@ fn of_gaps(low: &[u8], high: &[u8], [x, y, z]: [&Range<usize>; 3]) -> Values {
     if bins == 0 {
         return Values::NONE;
     }
-    Values {
-        bins,
-        min: min.into(),
-        max: max.into(),
-    }
+    Values { bins, min, max }
 }
 
 const _: () = assert!(GAPS == BRICK_EDGE as usize + 1);
@@ -175,21 +214,41 @@ mod tests {
 
     #[test]
     fn bins_are_those_between() {
-        assert_eq!(bins_between(0, 0), 1);
-        assert_eq!(bins_between(7, 8), 0b11);
-        assert_eq!(bins_between(255, 255), 1 << 31);
-        assert_eq!(bins_between(0, 255), u32::MAX);
-        for low in 0..=255_u8 {
-            for high in [low, low.saturating_add(9), 255] {
+        let eight = Bins::of_bits(8);
+        assert_eq!(eight.between(0, 0), 1);
+        assert_eq!(eight.between(7, 8), 0b11);
+        assert_eq!(eight.between(255, 255), 1 << 31);
+        assert_eq!(eight.between(0, 255), u32::MAX);
+        for low in 0..=255_u16 {
+            for high in [low, (low + 9).min(255), 255] {
                 let want = (low >> 3..=high >> 3).fold(0, |bins, bin| bins | 1_u32 << bin);
-                assert_eq!(bins_between(low, high), want, "{low} to {high}");
+                assert_eq!(eight.between(low, high), want, "{low} to {high}");
             }
+        }
+        // Twelve bits in sixteen: what is larger than expected is in the last bin.
+        let twelve = Bins::of_bits(12);
+        assert_eq!(twelve.between(127, 128), 0b11);
+        assert_eq!(twelve.between(4095, 60_000), 1 << 31);
+    }
+
+    #[test]
+    fn bins_cover_all_values_once() {
+        for bits in [5, 8, 12, 16] {
+            let bins = Bins::of_bits(bits);
+            let mut next = 0_u32;
+            for bin in 0..32 {
+                let [first, last] = bins.values(bin);
+                assert_eq!(u32::from(first), next, "{bits} bits, bin {bin}");
+                assert_eq!((bins.of(first), bins.of(last)), (bin, bin));
+                next = u32::from(last) + 1;
+            }
+            assert_eq!(next, 1 << 16);
         }
     }
 
     #[test]
     fn words_keep_ranges() {
-        let values = Values::between(3, 200);
+        let values = Values::between(3, 200, Bins::of_bits(8));
         assert_eq!(Values::from_words(values.bins, values.range_word()), values);
         assert_eq!(Values::NONE.or(values), values);
     }
@@ -212,7 +271,7 @@ mod tests {
             .collect();
         let thirds = [0..9, 8..17, 16..25, 24..33];
         let halves = [0..17, 16..33];
-        let values = BrickValues::of_voxels(&voxels, [&thirds, &halves, &halves]);
+        let values = BrickValues::of_voxels(&voxels, Bins::of_bits(8), [&thirds, &halves, &halves]);
         let regions = values.regions.clone().unwrap();
         assert!(regions.iter().any(|v| v.bins.count_ones() < 20));
         let at = |[x, y, z]: [usize; 3]| f64::from(voxels[(z * STORED + y) * STORED + x]);
@@ -248,8 +307,12 @@ mod tests {
     #[test]
     fn bricks_of_one_value_have_no_regions() {
         let quarters = [0..17, 16..33];
-        let brick =
-            BrickValues::of_voxels(&[9; BRICK_STORED_VOXELS], [&quarters, &quarters, &quarters]);
-        assert_eq!(brick, BrickValues::uniform(Values::between(9, 9)));
+        let regions: [&[Range<usize>]; 3] = [&quarters, &quarters, &quarters];
+        let bins = Bins::of_bits(8);
+        let brick = BrickValues::of_voxels(&[9_u8; BRICK_STORED_VOXELS], bins, regions);
+        assert_eq!(brick, BrickValues::uniform(Values::between(9, 9, bins)));
+        let deep = Bins::of_bits(12);
+        let brick = BrickValues::of_voxels(&[999_u16; BRICK_STORED_VOXELS], deep, regions);
+        assert_eq!(brick, BrickValues::uniform(Values::between(999, 999, deep)));
     }
 }

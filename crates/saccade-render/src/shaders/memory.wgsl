@@ -1,4 +1,4 @@
-// Virtual memory: from (level, brick) to a slot of the brick cache, and what was met on the way.
+// Virtual memory: from (channel, level, brick) to a slot of the brick cache, and what was met on the way.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> directory: array<u32>;
@@ -17,13 +17,18 @@ struct Found {
     span_log2: u32, // edge of what lies under the entry [log2 of bricks]
 }
 
-// The page table block used last, at the last step: most bricks along a ray share it.
-var<private> last_level: u32 = 0xffffffffu;
-var<private> last_block: vec3u;
-var<private> last_first: u32;
+// A page table block at the last step.
+struct LeafBlock {
+    at: vec3u,
+    level: u32, // one more than the level; 0 is none
+    first: u32, // first entry
+}
+
+// The one used last, per channel: most bricks along a ray share it.
+var<private> last: array<LeafBlock, SLOTS>;
 
 var<private> lookups: u32;
-var<private> misses_left: u32 = MISSES_PER_RAY;
+var<private> misses_left: u32 = max(MISSES_PER_RAY, MISSES_PER_CHANNEL * SLOTS);
 
 fn mark_used(slot: u32) {
     let word = COUNTERS + slot / 32u;
@@ -69,20 +74,21 @@ fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
     return Found(value & ~STALE, (value & STALE) != 0u, physical, span_log2);
 }
 
-fn find(level: u32, brick: vec3u) -> Found {
+fn find(channel: u32, level: u32, brick: vec3u) -> Found {
     lookups += 1u;
     let edge = frame.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
     let block_at = brick >> vec3u(edge);
-    if level == last_level && all(block_at == last_block) {
+    if level + 1u == last[channel].level && all(block_at == last[channel].at) {
         let at = brick & inside;
-        let entry = last_first + ((((at.z << edge) + at.y) << edge) + at.x);
+        let entry = last[channel].first + ((((at.z << edge) + at.y) << edge) + at.x);
         return found_at(tables[entry], frame.directory_entries + entry, 0u);
     }
     var span = edge * (frame.depth - 1u);
     let size = frame.levels[level].directory;
     let cell = brick >> vec3u(span);
-    var physical = frame.levels[level].directory_base + (cell.z * size.y + cell.y) * size.x + cell.x;
+    let base = frame.channels[channel].directory_offset + frame.levels[level].directory_base;
+    var physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
     var value = directory[physical];
     loop {
         let slot = value & ~STALE;
@@ -98,9 +104,7 @@ fn find(level: u32, brick: vec3u) -> Found {
         physical = frame.directory_entries + entry;
         value = tables[entry];
         if span == 0u {
-            last_level = level;
-            last_block = block_at;
-            last_first = first;
+            last[channel] = LeafBlock(block_at, level + 1u, first);
         }
     }
     return found_at(value, physical, span);

@@ -3,24 +3,41 @@
 // Nodes are words: the block of their eight children, then what is known per channel. What a node
 // says about values holds for some levels only, and it says for which.
 
-@group(0) @binding(6) var<storage, read> transfer: Transfer;
+@group(0) @binding(6) var<storage, read> transfer: array<Transfer>;
 @group(0) @binding(10) var<storage, read> nodes: array<u32>;
 
-// What is known of the space around a sample.
+// What is known of the space around a sample, a bit per channel.
 struct Region {
-    hidden: bool,   // no sample of the level in it is visible
-    uniform_: bool, // all samples of the level in it are `stored`
-    stored: f32,    // [0, 1]
-    leaving: f32,   // depth up to which this holds
+    hidden: u32,   // no sample in it is visible
+    uniform_: u32, // all samples in it are alike, see `uniform_stored`
+    leaving: f32,  // depth up to which this holds
 }
 
 // Nodes from the root to the one visited last: the next sample is in one of them, or near.
 var<private> path: array<u32, MOST_DEPTHS>;
+// Channels that are hidden in each of them, and those of which a closer look tells nothing new.
+var<private> path_hidden: array<u32, MOST_DEPTHS>;
+var<private> path_settled: array<u32, MOST_DEPTHS>;
 var<private> path_depth: u32;
 var<private> path_level: u32 = 0xffffffffu;
 var<private> path_cell: vec3u;
+// Of channels that are alike in a region, the value [0, 1].
+var<private> uniform_stored: array<f32, SLOTS>;
+// Of maximum projections, the largest stored value so far [0, 1].
+var<private> largest_seen: array<f32, SLOTS>;
 
 var<private> nodes_visited: u32;
+
+// The level of a channel that is drawn where `level` is wanted.
+fn channel_level(channel: u32, level: u32) -> u32 {
+    let here = frame.channels[channel];
+    return clamp(level + here.coarser, here.first_level, here.last_level);
+}
+
+// All channels that are seen, as bits.
+fn all_channels() -> u32 {
+    return (1u << channel_count()) - 1u;
+}
 
 // The cell of the volume nearest to a place on a ray.
 fn cell_at(depth: f32, ray: vec3f) -> vec3u {
@@ -45,19 +62,34 @@ fn leaving_node(cell: vec3u, depth: u32, ray: vec3f) -> f32 {
     return leaving_depth(low, high, frame.octree.eye, ray * frame.octree.cells_per_nm);
 }
 
-// Whether no value between two stored values, ends included, is visible.
-fn is_range_hidden(low: u32, high: u32) -> bool {
-    return transfer.opaque_before[high + 1u] == transfer.opaque_before[low];
+// Where a stored value, as an integer, is in the colour table [entries].
+fn table_position(channel: u32, value: f32) -> f32 {
+    let here = frame.channels[channel];
+    return clamp(value * here.table_scale + here.table_offset, 0.0, f32(TABLE_LEN - 1u));
 }
 
-// The largest node around a sample of a level that is hidden, all alike or nearly all seen, else the
-// deepest there.
+// Whether no value between two stored values, ends included, is visible.
+fn is_range_hidden(channel: u32, low: u32, high: u32) -> bool {
+    if MODE == MODE_MAXIMUM {
+        return f32(high) <= largest_seen[channel] * frame.largest;
+    }
+    let first = u32(table_position(channel, f32(low)));
+    let last = u32(ceil(table_position(channel, f32(high))));
+    return high == 0u || transfer[channel].opaque_before[last + 1u] == transfer[channel].opaque_before[first];
+}
+
+// The largest node around a sample in which each channel is hidden, all alike or nearly all seen, else the
+// deepest there. One walk for all channels [001 alg. 7.1].
 //
 // Starts from the nodes that the sample before was in [001 section 9.4]: those it shares with it
-// were neither.
+// were not enough.
 fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
     let cell = cell_at(depth, ray);
-    let deepest = frame.levels[level].values_depth;
+    let everything = all_channels();
+    var deepest = 0u;
+    for (var c = 0u; c < channel_count(); c += 1u) {
+        deepest = max(deepest, frame.levels[channel_level(c, level)].values_depth);
+    }
     var at = 0u;
     var is_new = true;
     if level == path_level {
@@ -71,25 +103,54 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
     path_cell = cell;
     path_level = level;
     var node = path[at];
-    var hidden = false;
-    var low = 0u;
-    var high = 1u;
+    var hidden = 0u;
+    var settled = 0u;
+    var alike = 0u;
+    if !is_new {
+        hidden = path_hidden[at];
+        settled = path_settled[at];
+    } else if at > 0u {
+        hidden = path_hidden[at - 1u];
+        settled = path_settled[at - 1u];
+    }
     loop {
         let first = node * frame.octree.node_words;
         if is_new {
             nodes_visited += 1u;
-            let known = first + NODE_CHANNEL;
-            if ((nodes[known + NODE_VALID] >> level) & 1u) != 0u {
-                let range = nodes[known + NODE_RANGE];
-                low = range & 0xffffu;
-                high = range >> 16u;
-                let bins = nodes[known + NODE_BINS];
-                let visible = countOneBits(bins & transfer.visible_bins);
-                hidden = visible == 0u || is_range_hidden(low, high);
-                // Where nearly all is seen, a closer look finds little to skip.
-                if hidden || low == high || visible * 4u > countOneBits(bins) * 3u {
-                    break;
+            alike = 0u;
+            for (var c = 0u; c < channel_count(); c += 1u) {
+                let bit = 1u << c;
+                if (hidden & bit) != 0u {
+                    continue;
                 }
+                if (frame.channels[c].flags & CHANNEL_VALUES) == 0u {
+                    settled |= bit;
+                    continue;
+                }
+                let known = first + NODE_CHANNEL + frame.channels[c].octree_slot * NODE_CHANNEL_WORDS;
+                if ((nodes[known + NODE_VALID] >> channel_level(c, level)) & 1u) == 0u {
+                    continue;
+                }
+                let range = nodes[known + NODE_RANGE];
+                let low = range & 0xffffu;
+                let high = range >> 16u;
+                let bins = nodes[known + NODE_BINS];
+                let visible = countOneBits(bins & transfer[c].visible_bins);
+                if visible == 0u || is_range_hidden(c, low, high) {
+                    hidden |= bit;
+                } else if low == high {
+                    alike |= bit;
+                    settled |= bit;
+                    uniform_stored[c] = f32(low) / frame.largest;
+                } else if visible * 4u > countOneBits(bins) * 3u {
+                    // Where nearly all is seen, a closer look finds little to skip.
+                    settled |= bit;
+                }
+            }
+            path_hidden[at] = hidden;
+            path_settled[at] = settled;
+            if (hidden | settled) == everything {
+                break;
             }
         }
         let children = nodes[first + NODE_CHILDREN];
@@ -102,20 +163,19 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
         is_new = true;
     }
     path_depth = at;
-    let stored = f32(low) / f32(TABLE_LEN - 1u);
-    return Region(hidden, low == high, stored, leaving_node(cell, at, ray));
+    return Region(hidden, alike, leaving_node(cell, at, ray));
 }
 
 // Levels that may be found around a place, as bits: a brick overlaps the smallest node there, or
 // something is known of its voxels. Nodes smaller than a brick leave noting it to larger ones.
-fn levels_around(cell: vec3u) -> u32 {
+fn levels_around(channel: u32, cell: vec3u) -> u32 {
     var node = 0u;
     var at = 0u;
     var levels = 0u;
     loop {
         nodes_visited += 1u;
         let first = node * frame.octree.node_words;
-        let known = first + NODE_CHANNEL;
+        let known = first + NODE_CHANNEL + frame.channels[channel].octree_slot * NODE_CHANNEL_WORDS;
         let resident = nodes[known + NODE_RESIDENT];
         levels |= nodes[known + NODE_VALID];
         let children = nodes[first + NODE_CHILDREN];

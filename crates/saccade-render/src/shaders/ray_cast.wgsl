@@ -1,6 +1,6 @@
-// One ray per pixel, front to back, through whatever bricks are there.
+// One ray per pixel, front to back, through whatever bricks are there, for all channels that are seen.
 //
-// A ray is cut into segments of half a voxel of the level wanted at their start, measured along the
+// A ray is cut into segments of half a voxel of the finest level drawn at their start, measured along the
 // ray; each is sampled once. The residency octree tells which can be skipped; other bricks are
 // looked up one by one, and all segments in one are sampled without further lookups. See the crate's documentation for the rules an image follows.
 
@@ -20,6 +20,7 @@ const PREVIEW_LEVELS = 2u;
 var<workgroup> tallies: array<atomic<u32>, TALLIES>;
 
 var<private> samples: u32;
+var<private> rays: u32;
 var<private> substituted: u32;
 var<private> substituted_levels: u32;
 var<private> finest: u32 = MAX_LEVELS;
@@ -49,17 +50,19 @@ fn leaving(level: u32, place: Place, span_log2: u32, ray: vec3f) -> f32 {
     return leaving_depth(low, high, frame.levels[level].eye, voxels);
 }
 
-fn is_transparent(slot: u32) -> bool {
+fn is_transparent(channel: u32, slot: u32) -> bool {
     let range = slot_ranges[slot];
-    let low = range & 0xffu;
-    let high = (range >> 8u) & 0xffu;
-    return is_range_hidden(low, high);
+    return is_range_hidden(channel, range & 0xffffu, range >> 16u);
 }
 
-fn color_of(stored: f32) -> vec4f {
-    let x = clamp(stored, 0.0, 1.0) * f32(TABLE_LEN - 1u);
+// Linear RGB and extinction of a stored value. Nothing acquired is nothing seen.
+fn color_of(channel: u32, stored: f32) -> vec4f {
+    if stored <= 0.0 {
+        return vec4f(0.0);
+    }
+    let x = table_position(channel, stored * frame.largest);
     let i = min(u32(x), TABLE_LEN - 2u);
-    return mix(transfer.colors[i], transfer.colors[i + 1u], x - f32(i));
+    return mix(transfer[channel].colors[i], transfer[channel].colors[i + 1u], x - f32(i));
 }
 
 // What is drawn for a stretch of the ray.
@@ -70,9 +73,9 @@ struct Source {
     leaving: f32, // depth up to which it holds
 }
 
-fn source(level: u32, depth: f32, ray: vec3f) -> Source {
+fn source(channel: u32, level: u32, depth: f32, ray: vec3f) -> Source {
     let place = place_of(level, depth, ray);
-    let found = find(level, place.brick);
+    let found = find(channel, level, place.brick);
     return Source(level, found, place, leaving(level, place, found.span_log2, ray));
 }
 
@@ -81,10 +84,10 @@ fn is_known(found: Found) -> bool {
 }
 
 // Empty space known to be empty in coarser levels too is skipped in one step.
-fn widened(empty: Source, depth: f32, ray: vec3f) -> Source {
+fn widened(channel: u32, empty: Source, depth: f32, ray: vec3f) -> Source {
     var wide = empty;
     for (var level = empty.level + 1u; level < frame.level_count; level += 1u) {
-        let coarser = source(level, depth, ray);
+        let coarser = source(channel, level, depth, ray);
         if coarser.found.entry != EMPTY || coarser.found.stale {
             break;
         }
@@ -99,22 +102,23 @@ fn bits_below(bit: u32) -> u32 {
 }
 
 // The nearest level that is there, coarser ones first [001 alg. 7.2].
-fn substitute(wanted: Source, depth: f32, ray: vec3f, urgency: f32) -> Source {
+fn substitute(channel: u32, wanted: Source, depth: f32, ray: vec3f, urgency: f32) -> Source {
     var there = 0xffffffffu;
-    if (frame.flags & FLAG_RESIDENCY) != 0u {
-        there = levels_around(cell_at(depth, ray));
+    if (frame.channels[channel].flags & CHANNEL_RESIDENCY) != 0u {
+        there = levels_around(channel, cell_at(depth, ray));
     }
-    let coarsest = frame.level_count - 1u;
+    let first_level = frame.channels[channel].first_level;
+    let coarsest = frame.channels[channel].last_level;
     let preview = min(wanted.level + PREVIEW_LEVELS, coarsest);
     var asked_for = 0u;
     if misses_left > 0u {
         asked_for = (1u << coarsest) | (1u << preview);
     }
-    var coarser = (there | asked_for) & bits_below(frame.level_count) & ~bits_below(wanted.level + 1u);
+    var coarser = (there | asked_for) & bits_below(coarsest + 1u) & ~bits_below(wanted.level + 1u);
     while coarser != 0u {
         let level = firstTrailingBit(coarser);
         coarser &= coarser - 1u;
-        var other = source(level, depth, ray);
+        var other = source(channel, level, depth, ray);
         if is_known(other.found) {
             other.leaving = min(other.leaving, wanted.leaving);
             return other;
@@ -126,12 +130,12 @@ fn substitute(wanted: Source, depth: f32, ray: vec3f, urgency: f32) -> Source {
             mark_missed(other.found, urgency * 1e-3);
         }
     }
-    let finest = wanted.level - min(wanted.level, FINER_SUBSTITUTES);
+    let finest = max(wanted.level - min(wanted.level, FINER_SUBSTITUTES), first_level);
     var finer = there & bits_below(wanted.level) & ~bits_below(finest);
     while finer != 0u {
         let level = firstLeadingBit(finer);
         finer &= bits_below(level);
-        var other = source(level, depth, ray);
+        var other = source(channel, level, depth, ray);
         if other.found.entry >= FIRST_SLOT {
             other.leaving = min(other.leaving, wanted.leaving);
             return other;
@@ -157,14 +161,128 @@ fn segments_until(until: f32, depth: f32, step: f32) -> u32 {
     return u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
 }
 
+// What is drawn of each channel, found for a sample of some level; holds for more of them.
+var<private> drawn: array<Source, SLOTS>;
+var<private> drawn_for: array<u32, SLOTS>;
+// A bit per channel: nothing is known of the brick; nothing of it is seen.
+var<private> missing: u32;
+var<private> transparent: u32;
+// Of the brick that is drawn: the first sample [texels], and the way to the next per depth.
+var<private> first_texel: array<vec3f, SLOTS>;
+var<private> texels_per_depth: array<vec3f, SLOTS>;
+var<private> low_texel: array<vec3f, SLOTS>;
+// The sample before, of surfaces [0, 1].
+var<private> sample_before: array<f32, SLOTS>;
+
+// Looks up what is drawn of a channel from `depth` on.
+fn look_up(channel: u32, wanted: u32, depth: f32, ray: vec3f, urgency: f32) {
+    let bit = 1u << channel;
+    var here = source(channel, wanted, depth, ray);
+    drawn_for[channel] = wanted;
+    var lacks = here.found.entry < EMPTY;
+    if lacks || here.found.stale {
+        mark_missed(here.found, depth * urgency);
+    }
+    if lacks && (frame.flags & FLAG_SUBSTITUTE) != 0u {
+        here = substitute(channel, here, depth, ray, depth * urgency);
+        lacks = here.found.entry < EMPTY;
+    } else if here.found.entry == EMPTY && !here.found.stale {
+        here = widened(channel, here, depth, ray);
+    }
+    var unseen = true;
+    if here.found.entry >= FIRST_SLOT {
+        let slot = here.found.entry - FIRST_SLOT;
+        mark_brick_used(slot);
+        unseen = is_transparent(channel, slot);
+    }
+    missing = select(missing & ~bit, missing | bit, lacks);
+    transparent = select(transparent & ~bit, transparent | bit, unseen);
+    drawn[channel] = here;
+}
+
+// Where samples from `depth` on lie in the brick cache.
+fn aim(channel: u32, depth: f32, ray: vec3f) {
+    let here = drawn[channel];
+    let slot = here.found.entry - FIRST_SLOT;
+    let grid = frame.brick_grid;
+    let cell = vec3u(slot % grid.x, slot / grid.x % grid.y, slot / (grid.x * grid.y));
+    let corner = vec3f(cell * BRICK_STORED_EDGE + BRICK_BORDER);
+    let voxels = ray * frame.levels[here.level].voxels_per_nm;
+    low_texel[channel] = corner;
+    first_texel[channel] = frame.levels[here.level].eye - here.place.low + depth * voxels;
+    texels_per_depth[channel] = voxels;
+}
+
+// The stored value at a place in a channel's brick [voxels from its low corner], from 0 to 1.
+fn stored_at(channel: u32, in_brick: vec3f) -> f32 {
+    let at = low_texel[channel] + in_brick;
+    if frame.combine.y > 0.0 {
+        return stored_of_parts(at);
+    }
+    let texel = 1.0 / vec3f(frame.brick_grid * BRICK_STORED_EDGE);
+    return textureSampleLevel(bricks, bricks_sampler, at * texel, 0.0).r;
+}
+
+// Interpolated from two parts of 8 bit. Samplers may round each part to 8 bit again, which is
+// too much of the high one; so the eight texels are joined first.
+fn stored_of_parts(at: vec3f) -> f32 {
+    let low = floor(at - 0.5);
+    let t = at - 0.5 - low;
+    let texel = vec3i(low);
+    let x0 = vec4f(
+        joined(texel),
+        joined(texel + vec3i(0, 1, 0)),
+        joined(texel + vec3i(0, 0, 1)),
+        joined(texel + vec3i(0, 1, 1)),
+    );
+    let x1 = vec4f(
+        joined(texel + vec3i(1, 0, 0)),
+        joined(texel + vec3i(1, 1, 0)),
+        joined(texel + vec3i(1, 0, 1)),
+        joined(texel + vec3i(1, 1, 1)),
+    );
+    let along_x = mix(x0, x1, t.x);
+    let along_y = mix(along_x.xz, along_x.yw, t.y);
+    return mix(along_y.x, along_y.y, t.z);
+}
+
+fn joined(texel: vec3i) -> f32 {
+    return dot(textureLoad(bricks, texel, 0).rg, frame.combine);
+}
+
+fn in_brick(channel: u32, ahead: f32) -> vec3f {
+    let at = first_texel[channel] + ahead * texels_per_depth[channel];
+    return clamp(at, vec3f(0.0), vec3f(f32(BRICK_EDGE)));
+}
+
+// Light from a surface in a channel's brick: as bright as it faces the eye.
+fn lit_surface(channel: u32, ahead: f32, ray: vec3f) -> vec3f {
+    let at = in_brick(channel, ahead);
+    let x = vec3f(0.5, 0.0, 0.0);
+    let slope = vec3f(
+        stored_at(channel, at + x) - stored_at(channel, at - x),
+        stored_at(channel, at + x.yxz) - stored_at(channel, at - x.yxz),
+        stored_at(channel, at + x.yzx) - stored_at(channel, at - x.yzx),
+    );
+    let gradient = slope * frame.levels[drawn[channel].level].voxels_per_nm;
+    let facing = abs(dot(gradient, ray)) / max(length(gradient) * length(ray), 1e-30);
+    // Where values do not change there is no surface to light: as if it faced the eye.
+    let diffuse = select(facing, 1.0, length(gradient) <= 1e-30);
+    return color_of(channel, transfer[channel].iso).rgb * (0.15 + 0.85 * diffuse);
+}
+
 fn trace(pixel: vec2u) -> vec3f {
     let from_middle = (vec2f(pixel) + 0.5) / vec2f(frame.size) * 2.0 - 1.0;
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
     let nm_per_depth = length(ray);
-    let depths = box_depths(frame.low_nm, frame.high_nm, ray);
+    var depths = box_depths(frame.low_nm, frame.high_nm, ray);
+    for (var p = 0u; p < MOST_PLANES; p += 1u) {
+        depths = clipped_depths(depths, frame.planes[p], ray);
+    }
     let urgency = 1.0 + dot(from_middle, from_middle);
     let sample_at = select(0.5, pixel_noise(pixel), (frame.flags & FLAG_JITTER) != 0u);
     let false_colors = (frame.flags & FLAG_FALSE_COLORS) != 0u;
+    let everything = all_channels();
 
     var light = vec3f(0.0);
     var transmitted = 1.0;
@@ -172,11 +290,14 @@ fn trace(pixel: vec2u) -> vec3f {
     var level = 0u;
     var level_end = -1.0;
     var segments = 0u;
-    // What is drawn, found for a sample of some level; holds for more of them.
-    var drawn: Source;
-    var drawn_for = frame.level_count;
-    var missing = false;
-    var transparent = false;
+    missing = 0u;
+    transparent = 0u;
+    for (var c = 0u; c < channel_count(); c += 1u) {
+        drawn_for[c] = MAX_LEVELS;
+        largest_seen[c] = 0.0;
+        sample_before[c] = 0.0;
+    }
+    rays = select(0u, 1u, start < depths.y && frame.level_count > 0u);
     while start < depths.y && transmitted > TERMINATION && frame.level_count > 0u {
         while start >= level_end {
             if level_end >= 0.0 {
@@ -184,9 +305,13 @@ fn trace(pixel: vec2u) -> vec3f {
             }
             level_end = depth_of_next(level, ray);
         }
-        finest = min(finest, level);
+        var finest_drawn = MAX_LEVELS;
+        for (var c = 0u; c < channel_count(); c += 1u) {
+            finest_drawn = min(finest_drawn, channel_level(c, level));
+        }
+        finest = min(finest, finest_drawn);
 
-        let voxels_per_depth = length(ray * frame.levels[level].voxels_per_nm);
+        let voxels_per_depth = length(ray * frame.levels[finest_drawn].voxels_per_nm);
         let doublings = min(segments / SEGMENTS_PER_DOUBLING, 64u);
         let step = 0.5 / voxels_per_depth * exp2(f32(doublings));
         let first = min(step, depths.y - start);
@@ -194,17 +319,32 @@ fn trace(pixel: vec2u) -> vec3f {
 
         // Depth of the first sample that may need another level, and of the ray's end.
         var until = min(level_end + sample_at * step, depths.y + sample_at * step);
+        var around = until;
+        var hidden = 0u;
         if (frame.flags & FLAG_OCTREE) != 0u {
             let region = region_at(level, depth, ray);
-            until = min(until, region.leaving);
-            if region.hidden || region.uniform_ {
-                let count = segments_until(until, depth, step);
-                if !region.hidden {
-                    let color = color_of(region.stored);
-                    let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
-                    let opacity = opacity_of_length(color.a, thickness * nm_per_depth);
-                    light += transmitted * opacity * color.rgb;
-                    transmitted *= 1.0 - opacity;
+            hidden = region.hidden;
+            around = region.leaving;
+            let even = MODE == MODE_EMISSION_ABSORPTION && (hidden | region.uniform_) == everything;
+            if hidden == everything || even {
+                let count = segments_until(min(until, around), depth, step);
+                if hidden != everything {
+                    var sum = vec4f(0.0);
+                    for (var c = 0u; c < channel_count(); c += 1u) {
+                        if (hidden & (1u << c)) == 0u {
+                            let color = color_of(c, uniform_stored[c]);
+                            sum += vec4f(color.a * color.rgb, color.a);
+                        }
+                    }
+                    if sum.a > 0.0 {
+                        let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
+                        let opacity = opacity_of_length(sum.a, thickness * nm_per_depth);
+                        light += transmitted * opacity * sum.rgb / sum.a;
+                        transmitted *= 1.0 - opacity;
+                    }
+                }
+                for (var c = 0u; c < channel_count(); c += 1u) {
+                    sample_before[c] = 0.0;
                 }
                 start += f32(count) * step;
                 segments += count;
@@ -212,66 +352,89 @@ fn trace(pixel: vec2u) -> vec3f {
             }
         }
 
-        if level != drawn_for || depth >= drawn.leaving {
-            drawn = source(level, depth, ray);
-            drawn_for = level;
-            missing = drawn.found.entry < EMPTY;
-            if missing || drawn.found.stale {
-                mark_missed(drawn.found, depth * urgency);
+        for (var c = 0u; c < channel_count(); c += 1u) {
+            let bit = 1u << c;
+            if (hidden & bit) != 0u {
+                until = min(until, around);
+                sample_before[c] = 0.0;
+                continue;
             }
-            if missing && (frame.flags & FLAG_SUBSTITUTE) != 0u {
-                drawn = substitute(drawn, depth, ray, depth * urgency);
-                missing = drawn.found.entry < EMPTY;
-            } else if drawn.found.entry == EMPTY && !drawn.found.stale {
-                drawn = widened(drawn, depth, ray);
+            let wanted = channel_level(c, level);
+            if wanted != drawn_for[c] || depth >= drawn[c].leaving {
+                look_up(c, wanted, depth, ray, urgency * f32(1u + frame.channels[c].coarser));
             }
-            transparent = true;
-            if drawn.found.entry >= FIRST_SLOT {
-                let slot = drawn.found.entry - FIRST_SLOT;
-                mark_brick_used(slot);
-                transparent = is_transparent(slot);
+            // Where nothing of a brick is seen, it is passed as a whole.
+            until = min(until, drawn[c].leaving);
+            if (transparent & bit) == 0u {
+                until = min(until, around);
             }
         }
-        if transparent {
-            // Nothing to sample, as far as this brick goes.
-            until = min(level_end + sample_at * step, depths.y + sample_at * step);
-        }
-        until = min(until, drawn.leaving);
         let count = segments_until(until, depth, step);
 
-        if drawn.found.entry >= FIRST_SLOT {
-            let slot = drawn.found.entry - FIRST_SLOT;
-            let distance = i32(drawn.level) - i32(level);
-            if distance != 0 {
-                substituted_levels = max(substituted_levels, u32(abs(distance)));
-                substituted += count;
+        let sampled = everything & ~hidden & ~transparent;
+        for (var c = 0u; c < channel_count(); c += 1u) {
+            let bit = 1u << c;
+            if (hidden & bit) == 0u && drawn[c].found.entry >= FIRST_SLOT {
+                let distance = i32(drawn[c].level) - i32(drawn_for[c]);
+                if distance != 0 {
+                    substituted_levels = max(substituted_levels, u32(abs(distance)));
+                    substituted += count;
+                }
             }
-            if !transparent {
-                let grid = frame.brick_grid;
-                let cell = vec3u(slot % grid.x, slot / grid.x % grid.y, slot / (grid.x * grid.y));
-                let corner = vec3f(cell * BRICK_STORED_EDGE + BRICK_BORDER);
-                let texel = 1.0 / vec3f(grid * BRICK_STORED_EDGE);
-                let voxels = ray * frame.levels[drawn.level].voxels_per_nm;
-                let begin = frame.levels[drawn.level].eye - drawn.place.low + depth * voxels;
-                for (var i = 0u; i < count && transmitted > TERMINATION; i += 1u) {
-                    let segment = min(step, depths.y - start - f32(i) * step);
-                    let ahead = f32(i) * step + sample_at * (segment - first);
-                    let in_brick = clamp(begin + ahead * voxels, vec3f(0.0), vec3f(f32(BRICK_EDGE)));
-                    let at = (corner + in_brick) * texel;
-                    let stored = textureSampleLevel(bricks, bricks_sampler, at, 0.0).r;
-                    var color = color_of(stored);
-                    if color.a > 0.0 {
+            if (sampled & bit) != 0u {
+                aim(c, depth, ray);
+            } else {
+                sample_before[c] = 0.0;
+            }
+        }
+        if sampled != 0u {
+            for (var i = 0u; i < count && transmitted > TERMINATION; i += 1u) {
+                let segment = min(step, depths.y - start - f32(i) * step);
+                let ahead = f32(i) * step + sample_at * (segment - first);
+                var sum = vec4f(0.0);
+                var surface_at = 3e38;
+                var surface = 0u;
+                for (var c = 0u; c < channel_count(); c += 1u) {
+                    if (sampled & (1u << c)) == 0u {
+                        continue;
+                    }
+                    let stored = stored_at(c, in_brick(c, ahead));
+                    samples += 1u;
+                    if MODE == MODE_MAXIMUM {
+                        largest_seen[c] = max(largest_seen[c], stored);
+                    } else if MODE == MODE_ISO_SURFACE {
+                        let iso = transfer[c].iso;
+                        if stored >= iso {
+                            let rise = stored - sample_before[c];
+                            let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);
+                            let at = ahead - back * step;
+                            if at < surface_at {
+                                surface_at = at;
+                                surface = c;
+                            }
+                        }
+                        sample_before[c] = stored;
+                    } else {
+                        var color = color_of(c, stored);
+                        let distance = i32(drawn[c].level) - i32(drawn_for[c]);
                         if false_colors && distance != 0 {
                             color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
                         }
-                        let opacity = opacity_of_length(color.a, max(segment, 0.0) * nm_per_depth);
-                        light += transmitted * opacity * color.rgb;
-                        transmitted *= 1.0 - opacity;
+                        sum += vec4f(color.a * color.rgb, color.a);
                     }
-                    samples += 1u;
+                }
+                if sum.a > 0.0 {
+                    let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
+                    light += transmitted * opacity * sum.rgb / sum.a;
+                    transmitted *= 1.0 - opacity;
+                }
+                if surface_at < 3e38 {
+                    light += transmitted * lit_surface(surface, surface_at, ray);
+                    transmitted = 0.0;
                 }
             }
-        } else if missing && false_colors {
+        }
+        if (missing & ~hidden) != 0u && false_colors {
             // A thin magenta fog: half the light is gone after 64 voxels.
             let voxels = f32(count) * step * voxels_per_depth;
             let opacity = 1.0 - exp2(-voxels / 64.0);
@@ -281,7 +444,38 @@ fn trace(pixel: vec2u) -> vec3f {
         start += f32(count) * step;
         segments += count;
     }
+    if MODE == MODE_MAXIMUM {
+        // The light of what was met, or the background where nothing was.
+        var met = false;
+        for (var c = 0u; c < channel_count(); c += 1u) {
+            if largest_seen[c] > 0.0 {
+                light += transmitted * color_of(c, largest_seen[c]).rgb;
+                met = true;
+            }
+        }
+        if met {
+            return light;
+        }
+    }
     return light + transmitted * frame.background;
+}
+
+// What is drawn instead of the volume, if asked for: how much work a ray was.
+fn heat_of(color: vec3f) -> vec3f {
+    switch frame.heat {
+        case HEAT_LOOKUPS: {
+            return heat_color(f32(lookups) / frame.heat_full);
+        }
+        case HEAT_NODES: {
+            return heat_color(f32(nodes_visited) / frame.heat_full);
+        }
+        case HEAT_SAMPLES: {
+            return heat_color(f32(samples) / frame.heat_full);
+        }
+        default: {
+            return color;
+        }
+    }
 }
 
 @compute @workgroup_size(WORKGROUP, WORKGROUP)
@@ -291,7 +485,7 @@ fn main(
 ) {
     let pixel = vec2u(id.x, id.y + frame.first_row);
     if all(pixel < frame.size) {
-        let color = trace(pixel);
+        let color = heat_of(trace(pixel));
         textureStore(image, pixel, vec4f(srgb_from_linear(color), 1.0));
         atomicAdd(&tallies[COUNT_SAMPLES], samples);
         atomicAdd(&tallies[COUNT_LOOKUPS], lookups);
@@ -300,6 +494,12 @@ fn main(
         atomicMax(&tallies[MOST_SUBSTITUTED_LEVELS], substituted_levels);
         // Counted from the top, since zero means that no ray met the volume.
         atomicMax(&tallies[FINEST_LEVEL], MAX_LEVELS - finest);
+        atomicAdd(&tallies[COUNT_RAYS], rays);
+        if rays > 0u {
+            atomicMax(&tallies[MOST_LOOKUPS], lookups);
+            // Counted from the top as well.
+            atomicMax(&tallies[FEWEST_LOOKUPS], 0xffffffffu - lookups);
+        }
     }
     workgroupBarrier();
     if local == 0u {
@@ -309,5 +509,8 @@ fn main(
         atomicAdd(&report[COUNT_SUBSTITUTED], atomicLoad(&tallies[COUNT_SUBSTITUTED]));
         atomicMax(&report[MOST_SUBSTITUTED_LEVELS], atomicLoad(&tallies[MOST_SUBSTITUTED_LEVELS]));
         atomicMax(&report[FINEST_LEVEL], atomicLoad(&tallies[FINEST_LEVEL]));
+        atomicAdd(&report[COUNT_RAYS], atomicLoad(&tallies[COUNT_RAYS]));
+        atomicMax(&report[MOST_LOOKUPS], atomicLoad(&tallies[MOST_LOOKUPS]));
+        atomicMax(&report[FEWEST_LOOKUPS], atomicLoad(&tallies[FEWEST_LOOKUPS]));
     }
 }

@@ -7,8 +7,10 @@
 #![expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
 
 mod behaviour;
+mod channels;
 mod functions;
 mod harness;
+mod modes;
 mod octree;
 mod oracle;
 mod pictures;

@@ -286,8 +286,8 @@ fn what_a_source_knows_to_be_hidden_is_never_asked_for() {
             let raw = scene.brick(id).unwrap_or_default();
             let measured = || raw.iter().copied().filter(|&v| v != 0);
             let range = measured().min().zip(measured().max());
-            let hidden =
-                noted.insert(id) && range.is_some_and(|(min, max)| with.note_range(id, [min, max]));
+            let hidden = noted.insert(id)
+                && range.is_some_and(|(min, max)| with.note_range(id, [min, max].map(u16::from)));
             if !hidden {
                 deliver(&mut with, &scene, id);
             }

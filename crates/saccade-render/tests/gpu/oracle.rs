@@ -3,7 +3,8 @@
 //! It follows the rules in the crate's documentation and shares no code with the crate.
 
 use glam::{DVec3, UVec2};
-use saccade_render::{Image, View};
+use saccade_core::volume::Polarity;
+use saccade_render::{Image, Mode, View};
 
 use crate::scene::Scene;
 
@@ -47,9 +48,12 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
         .ray(pixel.as_dvec2() + 0.5, view.size.as_dvec2());
     let mut light = [0.0; 3];
     let mut transmitted = 1.0;
-    if let Some((near, far)) = slab(eye, ray, scene.volume.size_nm()) {
+    let channels: Vec<&Scene> = scene.channels().collect();
+    let mut largest = vec![0.0_f64; channels.len()];
+    let mut before = vec![0.0_f64; channels.len()];
+    if let Some((near, far)) = clipped(scene, view, eye, ray) {
         let mut start = near;
-        while start < far {
+        while start < far && transmitted > 0.0 {
             let level = level_at(scene, view, ray, start);
             let voxel = scene.volume.voxel_nm * scene.volume.levels[level].downsampling;
             let half_voxel = 0.5 / (ray / voxel).length();
@@ -58,17 +62,118 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
                 Cut::Fine => half_voxel / 16.0,
             };
             let end = (start + step).min(far);
-            let at = eye + ray * ((start + end) / 2.0);
-            let [r, g, b, extinction] = color(scene, interpolated(scene, level, at / voxel));
-            let opacity = 1.0 - (-extinction * (end - start) * ray.length()).exp();
-            for (light, color) in light.iter_mut().zip([r, g, b]) {
-                *light += transmitted * opacity * color;
+            let depth = (start + end) / 2.0;
+            let at = eye + ray * depth;
+            let mut sum = [0.0; 4];
+            let mut surface: Option<(f64, usize)> = None;
+            for (index, channel) in channels.iter().enumerate() {
+                let stored = interpolated(channel, level, at / voxel);
+                largest[index] = largest[index].max(stored);
+                let iso = stored_iso(channel);
+                if stored >= iso {
+                    let back = (stored - iso) / (stored - before[index]).max(1e-9);
+                    let back = if before[index] < iso { back } else { 0.0 };
+                    let hit = depth - back * step;
+                    if surface.is_none_or(|(other, _)| hit < other) {
+                        surface = Some((hit, index));
+                    }
+                }
+                before[index] = stored;
+                let [r, g, b, extinction] = color(channel, stored);
+                for (sum, part) in sum.iter_mut().zip([r, g, b, 1.0]) {
+                    *sum += extinction * part;
+                }
             }
-            transmitted *= 1.0 - opacity;
+            match view.mode {
+                Mode::EmissionAbsorption if sum[3] > 0.0 => {
+                    let opacity = 1.0 - (-sum[3] * (end - start) * ray.length()).exp();
+                    for (light, emitted) in light.iter_mut().zip(sum) {
+                        *light += transmitted * opacity * emitted / sum[3];
+                    }
+                    transmitted *= 1.0 - opacity;
+                }
+                Mode::IsoSurface => {
+                    if let Some((hit, index)) = surface {
+                        light = lit(channels[index], level, eye + ray * hit, ray);
+                        transmitted = 0.0;
+                    }
+                }
+                Mode::EmissionAbsorption | Mode::Maximum => {}
+            }
             start += step;
         }
     }
+    if view.mode == Mode::Maximum && largest.iter().any(|&value| value > 0.0) {
+        for (channel, &value) in channels.iter().zip(&largest) {
+            let [color @ .., _] = if value > 0.0 {
+                color(channel, value)
+            } else {
+                [0.0; 4]
+            };
+            for (light, color) in light.iter_mut().zip(color) {
+                *light += color;
+            }
+        }
+        return light;
+    }
     std::array::from_fn(|c| light[c] + transmitted * f64::from(view.background[c]))
+}
+
+/// Stored value of a channel's surface.
+fn stored_iso(scene: &Scene) -> f64 {
+    match scene.transfer.polarity {
+        Polarity::Bright => scene.iso,
+        Polarity::Dark => 256.0 - scene.iso,
+    }
+}
+
+/// A surface lit from the eye.
+fn lit(scene: &Scene, level: usize, at: DVec3, ray: DVec3) -> [f64; 3] {
+    let voxel = scene.volume.voxel_nm * scene.volume.levels[level].downsampling;
+    let slope = |axis: DVec3| {
+        let value = |sign: f64| interpolated(scene, level, at / voxel + axis * sign * 0.5);
+        value(1.0) - value(-1.0)
+    };
+    let gradient = DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z)) / voxel;
+    let facing = gradient
+        .normalize_or_zero()
+        .dot(ray.normalize_or_zero())
+        .abs();
+    let [r, g, b, _] = color(scene, stored_iso(scene));
+    [r, g, b].map(|color| color * (0.15 + 0.85 * facing))
+}
+
+/// The part of a ray that is in the volume and not clipped.
+fn clipped(scene: &Scene, view: &View, eye: DVec3, ray: DVec3) -> Option<(f64, f64)> {
+    let size = scene.volume.size_nm();
+    let [low, high] = match view.clip.within {
+        Some([a, b]) => [
+            a.xyz.min(b.xyz).max(DVec3::ZERO),
+            a.xyz.max(b.xyz).min(size),
+        ],
+        None => [DVec3::ZERO, size],
+    };
+    let (mut near, mut far) = slab(eye - low, ray, high - low)?;
+    let mut keep = |point: DVec3, normal: DVec3| {
+        let (approach, distance) = (normal.dot(ray), normal.dot(point - eye));
+        if approach > 0.0 {
+            near = near.max(distance / approach);
+        } else if approach < 0.0 {
+            far = far.min(distance / approach);
+        } else if distance > 0.0 {
+            far = near;
+        }
+    };
+    for half in view.clip.half_spaces.into_iter().flatten() {
+        keep(half.point.xyz, half.normal);
+    }
+    if let Some(slab) = view.clip.slab {
+        let normal = slab.normal.normalize_or_zero();
+        let half = normal * slab.thickness_nm / 2.0;
+        keep(slab.point.xyz - half, normal);
+        keep(slab.point.xyz + half, -normal);
+    }
+    (near < far).then_some((near, far))
 }
 
 /// Where the ray is between all three pairs of faces, in front of the eye.

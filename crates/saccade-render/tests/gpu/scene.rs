@@ -5,8 +5,9 @@ use std::sync::Arc;
 use glam::{DVec3, UVec3};
 use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
 use saccade_core::transfer::{ColorMap, OpacityPoint, TABLE_LEN, TransferFunction};
-use saccade_core::volume::{Polarity, Volume};
+use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
+use saccade_render::ChannelView;
 
 /// All levels of a volume, in main memory.
 pub(crate) struct Scene {
@@ -15,6 +16,12 @@ pub(crate) struct Scene {
     pub(crate) levels: Vec<Vec<u8>>,
     pub(crate) transfer: TransferFunction,
     pub(crate) table: [[f32; 4]; TABLE_LEN],
+    /// Value of the surface, `[0, 255]`.
+    pub(crate) iso: f64,
+    /// Channels after the first, of the same shape.
+    pub(crate) others: Vec<Self>,
+    /// 1, or what 16-bit values are more than 8-bit ones.
+    pub(crate) factor: u16,
 }
 
 impl Scene {
@@ -52,7 +59,57 @@ impl Scene {
             levels,
             table: transfer.table(),
             transfer,
+            iso: 128.0,
+            others: Vec::new(),
+            factor: 1,
         }
+    }
+
+    /// A volume of several channels, all of the same shape.
+    pub(crate) fn of_channels(mut channels: Vec<Self>) -> Self {
+        let mut first = channels.remove(0);
+        let names = (0..=channels.len()).map(|n| format!("channel {n}"));
+        first.volume = Arc::new(Volume {
+            channels: names.collect(),
+            ..(*first.volume).clone()
+        });
+        first.others = channels;
+        first
+    }
+
+    /// The same in 16 bit, values `factor` times as large.
+    pub(crate) fn deep(mut self, factor: u16) -> Self {
+        self.volume = Arc::new(Volume {
+            dtype: Dtype::Uint16,
+            ..(*self.volume).clone()
+        });
+        self.factor = factor;
+        self.others = self.others.into_iter().map(|c| c.deep(factor)).collect();
+        self
+    }
+
+    /// All channels.
+    pub(crate) fn channels(&self) -> impl Iterator<Item = &Self> {
+        std::iter::once(self).chain(&self.others)
+    }
+
+    /// How all channels are seen.
+    pub(crate) fn views(&self) -> Vec<ChannelView> {
+        let largest = if self.factor == 1 { 255.0 } else { 65_535.0 };
+        let scale = f32::from(self.factor) * 255.0 / largest;
+        let views = (0..).zip(self.channels()).map(|(channel, scene)| {
+            let mut transfer = scene.transfer.clone();
+            transfer.window = transfer.window.map(|value| value * scale);
+            for point in &mut transfer.opacity {
+                point.value *= scale;
+            }
+            ChannelView {
+                iso: (scene.iso * f64::from(self.factor)) as f32 / largest,
+                significant_bits: 8 + u32::from(self.factor.ilog2() as u8),
+                ..ChannelView::new(channel, transfer)
+            }
+        });
+        views.collect()
     }
 
     /// Stored value of a voxel of a level; 0 outside.
@@ -70,6 +127,10 @@ impl Scene {
 
     /// A brick with its border, as a source delivers it; `None` where nothing was acquired.
     pub(crate) fn brick(&self, id: BrickId) -> Option<Vec<u8>> {
+        if let Some(other) = id.channel().checked_sub(1) {
+            let id = BrickId::new(0, id.level(), id.brick()).unwrap();
+            return self.others[other as usize].brick(id);
+        }
         let level = id.level() as usize;
         let low = (id.brick() * BRICK_EDGE).as_i64vec3() - i64::from(BRICK_BORDER);
         let voxels = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE))
@@ -79,7 +140,14 @@ impl Scene {
                 self.transfer.polarity.stored(stored)
             });
         let voxels: Vec<u8> = voxels.collect();
-        voxels.iter().any(|&v| v != 0).then_some(voxels)
+        let some = voxels.iter().any(|&v| v != 0);
+        some.then(|| match self.factor {
+            1 => voxels,
+            factor => {
+                let deep = voxels.iter().map(|&v| u16::from(v) * factor);
+                deep.flat_map(u16::to_le_bytes).collect()
+            }
+        })
     }
 }
 
@@ -170,6 +238,32 @@ pub(crate) fn specks() -> Scene {
         let dim = 30.0 + 20.0 * (nm.x / 7.0).sin() * (nm.y / 5.0).cos() + (nm.z / 3.0).sin();
         dim + 200.0 * (1.0 - near / 40.0).max(0.0)
     })
+}
+
+/// Three kinds of matter, each in its channel and colour: waves, specks, and a slanted sheet.
+pub(crate) fn stained() -> Scene {
+    let extent = UVec3::new(61, 47, 33);
+    let nm = DVec3::new(4.0, 4.0, 20.0);
+    let transfer = |map, from, to| ramp(Polarity::Bright, map, &[(from, 0.0), (to, 0.5)], 40.0);
+    let waves = Scene::new(extent, nm, transfer(ColorMap::Green, 0.4, 0.8), |nm| {
+        128.0 + 50.0 * ((nm.x / 31.0).sin() + (nm.y / 23.0 + 1.0).cos() * (nm.z / 97.0).sin())
+    });
+    let size = extent.as_dvec3() * nm;
+    let seeds: Vec<DVec3> = (0..12).map(|n| halton(n) * size).collect();
+    let specks = Scene::new(extent, nm, transfer(ColorMap::Magenta, 0.2, 0.9), |nm| {
+        let near = seeds.iter().map(|s| s.distance(nm));
+        20.0 + 220.0 * (1.0 - near.fold(f64::INFINITY, f64::min) / 50.0).max(0.0)
+    });
+    let sheet = Scene::new(extent, nm, transfer(ColorMap::Inferno, 0.3, 1.0), |nm| {
+        let off = (nm.x + nm.y * 0.5 + nm.z * 0.3 - 250.0).abs();
+        // Nothing was imaged in a corner of this channel.
+        if nm.x < 40.0 {
+            0.0
+        } else {
+            10.0 + 200.0 * (1.0 - off / 60.0).max(0.0)
+        }
+    });
+    Scene::of_channels(vec![waves, specks, sheet])
 }
 
 /// Points that fill the unit cube evenly.

@@ -91,6 +91,39 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    /// Each byte of a wider voxel goes where the voxel goes.
+    #[test]
+    fn sixteen_bit_bricks_are_two_of_eight_bit(
+        extent in (1_u32..80, 1_u32..80, 1_u32..80).prop_map(UVec3::from),
+        chunk in (3_u32..70, 3_u32..70, 3_u32..70).prop_map(UVec3::from),
+        pick in (0_u32..3, 0_u32..3, 0_u32..3).prop_map(UVec3::from),
+    ) {
+        let bricks = saccade_core::brick::bricks_of(extent);
+        let id = BrickId::new(0, 0, pick.min(bricks - 1)).unwrap();
+        let narrow = volume(extent, chunk);
+        let high = |at: UVec3| value(at) ^ 1;
+        let [lows, highs] = [chunks(&narrow, value), chunks(&narrow, high)];
+        let wide = |id: &ChunkId| match (&lows[id], &highs[id]) {
+            (Chunk::Voxels(low), Chunk::Voxels(high)) => {
+                let pairs = low.iter().zip(high);
+                Chunk::Voxels(pairs.flat_map(|(&low, &high)| [low, high]).collect())
+            }
+            _ => Chunk::Empty,
+        };
+        let chunks: HashMap<_, _> = lows.keys().map(|id| (*id, wide(id))).collect();
+        let deep = Volume { dtype: saccade_core::volume::Dtype::Uint16, ..narrow };
+        let mut assembler = Assembler::default();
+        let got = assembler.assemble(id, &deep, |id| chunks.get(&id)).unwrap();
+        let BrickVoxels::Voxels(got) = got else { panic!("no voxel is 0") };
+        let part = |n: usize| got.iter().skip(n).step_by(2).copied().collect::<Vec<_>>();
+        prop_assert!(part(0) == expected(id, extent, value));
+        prop_assert!(part(1) == expected(id, extent, high));
+    }
+}
+
 #[test]
 fn the_comparison_notices_one_wrong_voxel() {
     let (extent, id) = (UVec3::new(40, 33, 35), brick(1, 1, 1));

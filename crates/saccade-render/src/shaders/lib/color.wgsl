@@ -19,3 +19,8 @@ fn substitution_tint(levels: i32) -> vec3f {
     let t = clamp(f32(levels - 1) / 3.0, 0.0, 1.0);
     return vec3f(min(2.0 * t + 0.1, 1.0), min(2.0 - 2.0 * t, 1.0), 0.0);
 }
+
+// From black through red and yellow to white, linear, for a share of 0 to 1.
+fn heat_color(share: f32) -> vec3f {
+    return clamp(vec3f(3.0 * share, 3.0 * share - 1.0, 3.0 * share - 2.0), vec3f(0.0), vec3f(1.0));
+}

@@ -15,7 +15,20 @@ const FLAG_SUBSTITUTE = 1u;
 const FLAG_FALSE_COLORS = 2u;
 const FLAG_JITTER = 4u;
 const FLAG_OCTREE = 8u;
-const FLAG_RESIDENCY = 16u;
+
+const MOST_CHANNELS = 16u;
+const MOST_PLANES = 6u;
+const CHANNEL_VALUES = 1u;
+const CHANNEL_RESIDENCY = 2u;
+
+const MODE_EMISSION_ABSORPTION = 0u;
+const MODE_MAXIMUM = 1u;
+const MODE_ISO_SURFACE = 2u;
+
+const HEAT_NONE = 0u;
+const HEAT_LOOKUPS = 1u;
+const HEAT_NODES = 2u;
+const HEAT_SAMPLES = 3u;
 
 const COUNTERS = 16u;
 const COUNT_MISSES = 0u;
@@ -26,7 +39,10 @@ const COUNT_SUBSTITUTED = 4u;
 const MOST_SUBSTITUTED_LEVELS = 5u;
 const FINEST_LEVEL = 6u;
 const COUNT_NODES = 7u;
-const TALLIES = 8u;
+const COUNT_RAYS = 8u;
+const MOST_LOOKUPS = 9u;
+const FEWEST_LOOKUPS = 10u;
+const TALLIES = 11u;
 
 const MOST_DEPTHS = 24u;
 const SIBLINGS = 8u;
@@ -40,3 +56,4 @@ const NODE_RESIDENT = 3u;
 
 const MISSES = 4096u;
 const MISSES_PER_RAY = 4u;
+const MISSES_PER_CHANNEL = 2u;

@@ -29,6 +29,18 @@ struct Octree {
     depths: array<Depth, MOST_DEPTHS>,
 }
 
+// A channel that is seen.
+struct Channel {
+    directory_offset: u32, // entries of the page directory before the channel's
+    octree_slot: u32,      // which of a node's channels it is
+    first_level: u32,      // finest level that is drawn
+    last_level: u32,       // coarsest level that is drawn
+    coarser: u32,          // levels coarser than wanted that suffice
+    flags: u32,            // CHANNEL_: what the octree says of it holds
+    table_scale: f32,      // to entries of the colour table from stored values
+    table_offset: f32,
+}
+
 struct Frame {
     forward: vec3f,         // ray through the middle of the picture, 1 nm of depth [nm]
     pixel: f32,             // size that a voxel is to have, per depth
@@ -46,13 +58,21 @@ struct Frame {
     first_row: u32,         // of this band
     size: vec2u,            // of the picture [pixels]
     usage_words: u32,       // words of slot usage in the report
+    channel_count: u32,     // channels that are seen
+    combine: vec2f,         // to a stored value from 0 to 1, of a texel's two parts
+    largest: f32,           // stored value that is 1
+    heat: u32,              // HEAT_: what is counted and drawn instead of the volume
+    heat_full: f32,         // count that is drawn as hot as can be
     levels: array<Level, MAX_LEVELS>,
     octree: Octree,
+    channels: array<Channel, MOST_CHANNELS>,
+    planes: array<vec4f, MOST_PLANES>, // what is seen has dot(xyz, position from the eye [nm]) + w >= 0
 }
 
-// Colours by stored value, and which values are seen at all.
+// Colours of a channel by stored value, and which values are seen at all.
 struct Transfer {
     colors: array<vec4f, TABLE_LEN>,       // linear RGB, extinction [1/nm]
     opaque_before: array<u32, 257>,        // entries below that are not transparent
-    visible_bins: u32,                     // a bit per eight entries: any that is not transparent
+    visible_bins: u32,                     // a bit per bin of stored values: any that is not transparent
+    iso: f32,                              // stored value of the surface [0, 1]
 }

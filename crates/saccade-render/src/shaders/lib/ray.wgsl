@@ -15,6 +15,19 @@ fn box_depths(low: vec3f, high: vec3f, ray: vec3f) -> vec2f {
     return vec2f(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
 }
 
+// The part of `depths` on the side of a plane where dot(plane.xyz, position) + plane.w >= 0.
+fn clipped_depths(depths: vec2f, plane: vec4f, ray: vec3f) -> vec2f {
+    let approach = dot(plane.xyz, ray);
+    if approach == 0.0 {
+        return select(depths, vec2f(1.0, 0.0), plane.w < 0.0);
+    }
+    let at = -plane.w / approach;
+    if approach > 0.0 {
+        return vec2f(max(depths.x, at), depths.y);
+    }
+    return vec2f(depths.x, min(depths.y, at));
+}
+
 // Depth at which a ray, at `from` when its depth is 0, leaves a box it is in.
 fn leaving_depth(low: vec3f, high: vec3f, from_: vec3f, ray: vec3f) -> f32 {
     let bound = select(low, high, ray >= vec3f(0.0));

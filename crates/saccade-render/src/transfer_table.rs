@@ -1,0 +1,265 @@
+//! From a transfer function to the table that shaders read, and to what it hides.
+
+use bytemuck::Zeroable;
+use saccade_core::transfer::{TABLE_LEN, TransferFunction};
+use saccade_core::volume::{Dtype, Polarity};
+
+use crate::channel::ChannelView;
+use crate::layout::TransferStorage;
+use crate::octree::Bins;
+use crate::view::Mode;
+
+/// Extinction beyond which nothing is seen any more, yet finite \[1/nm\].
+const OPAQUE: f64 = 1e6;
+
+/// A channel's colours by stored value.
+///
+/// Entry `i` belongs to stored value `(i - offset) / scale`. 8-bit values have an entry each; of 16-bit ones
+/// the entries share the range in which the transfer function changes, so that a narrow window is as smooth as a wide one.
+#[derive(Clone, Debug)]
+pub(crate) struct TransferTable {
+    pub(crate) storage: TransferStorage,
+    /// Entries per stored value.
+    pub(crate) scale: f32,
+    /// Entry of stored value 0.
+    pub(crate) offset: f32,
+    bins: Bins,
+    mode: Mode,
+}
+
+/// Largest value of a type.
+pub(crate) fn largest(dtype: Dtype) -> u16 {
+    match dtype {
+        Dtype::Uint16 => u16::MAX,
+        _ => u16::from(u8::MAX),
+    }
+}
+
+/// How the values of a channel are divided among the octree's bins.
+pub(crate) fn bins_of(view: &ChannelView, dtype: Dtype) -> Bins {
+    Bins::of_bits(match (dtype, view.transfer.polarity) {
+        // Inverted, small values are near the largest.
+        (Dtype::Uint16, Polarity::Dark) => 16,
+        (Dtype::Uint16, Polarity::Bright) => view.significant_bits,
+        _ => 8,
+    })
+}
+
+impl TransferTable {
+    pub(crate) fn new(view: &ChannelView, dtype: Dtype, mode: Mode) -> Self {
+        let largest = f64::from(largest(dtype));
+        let (first, span) = match dtype {
+            Dtype::Uint16 => domain(view, largest),
+            _ => (0.0, largest),
+        };
+        let last_entry = (TABLE_LEN - 1) as f64;
+        let scale = last_entry / span;
+        let inverted = |value: f64| match view.transfer.polarity {
+            Polarity::Bright => value,
+            Polarity::Dark => largest + 1.0 - value,
+        };
+        let iso = inverted(f64::from(view.iso) * largest);
+        let mut table = Self {
+            storage: TransferStorage::zeroed(),
+            scale: single(scale),
+            offset: single(-first * scale),
+            bins: bins_of(view, dtype),
+            mode,
+        };
+        table.storage.iso = single(iso / largest);
+        for index in 0..TABLE_LEN {
+            let stored = first + index as f64 / scale;
+            // Nothing acquired is nothing seen.
+            let nothing = stored < 0.5;
+            let value = if nothing {
+                0.0
+            } else {
+                inverted(stored) / largest
+            };
+            let [r, g, b] = view.transfer.color_at(single(value));
+            let extinction = match mode {
+                _ if nothing => 0.0,
+                Mode::EmissionAbsorption => extinction(&view.transfer, value),
+                Mode::Maximum => 1.0,
+                Mode::IsoSurface => f64::from(u8::from(stored >= iso)),
+            };
+            table.storage.colors[index] = [r, g, b, single(extinction)];
+            let opaque = u32::from(table.storage.colors[index][3] > 0.0);
+            table.storage.opaque_before[index + 1] = table.storage.opaque_before[index] + opaque;
+        }
+        for bin in 0..32 {
+            let [low, high] = table.bins.values(bin);
+            let seen = u32::from(!table.hides(low, high));
+            table.storage.visible_bins |= seen << bin;
+        }
+        table
+    }
+
+    /// Whether no stored value between two, ends included, is seen.
+    pub(crate) fn hides(&self, low: u16, high: u16) -> bool {
+        // As shaders do.
+        let at = |value: u16| (f32::from(value) * self.scale + self.offset).clamp(0.0, 255.0);
+        #[expect(clippy::cast_possible_truncation, reason = "0 to 255")]
+        #[expect(clippy::cast_sign_loss, reason = "0 to 255")]
+        let [first, last] = [at(low).floor(), at(high).ceil()].map(|at| at as usize);
+        let before = &self.storage.opaque_before;
+        high == 0 || before[last + 1] == before[first]
+    }
+
+    /// Whether no stored value between two is seen, or the largest so far is all that matters and
+    /// there is none.
+    pub(crate) fn hides_for_good(&self, low: u16, high: u16) -> bool {
+        match self.mode {
+            Mode::Maximum => high == 0,
+            Mode::EmissionAbsorption | Mode::IsoSurface => self.hides(low, high),
+        }
+    }
+}
+
+/// The stored values between which a channel's colours change: the first, and how many.
+fn domain(view: &ChannelView, largest: f64) -> (f64, f64) {
+    let transfer = &view.transfer;
+    let corners = transfer.opacity.iter().map(|point| point.value);
+    let corners = corners.chain(transfer.window).chain([view.iso]);
+    let corners = corners.map(|value| f64::from(value) * largest);
+    let corners = corners.filter(|value| value.is_finite());
+    let (low, high) = corners.fold((largest, 0.0_f64), |(low, high), value| {
+        (low.min(value), high.max(value))
+    });
+    let (low, high) = match transfer.polarity {
+        Polarity::Bright => (low, high),
+        Polarity::Dark => (largest + 1.0 - high, largest + 1.0 - low),
+    };
+    let low = low.clamp(0.0, largest).floor();
+    let span = (high - low).clamp((TABLE_LEN - 1) as f64, largest);
+    (low.min(largest - span), span)
+}
+
+/// Extinction of a measured value in `[0, 1]` \[1/nm\]: opacity in a form in which interpolation and step length
+/// commute.
+fn extinction(transfer: &TransferFunction, value: f64) -> f64 {
+    let length_nm = transfer.opacity_length_nm.max(f64::MIN_POSITIVE);
+    let opacity = transfer.opacity_at(single(value)).clamp(0.0, 0.999);
+    (-(-f64::from(opacity)).ln_1p() / length_nm).min(OPAQUE)
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the nearest f32 is what is wanted"
+)]
+fn single(value: f64) -> f32 {
+    value as f32
+}
+
+#[cfg(test)]
+#[expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
+mod tests {
+    use super::*;
+    use saccade_core::transfer::{ColorMap, OpacityPoint};
+
+    fn view(polarity: Polarity, points: &[(f32, f32)], window: [f32; 2]) -> ChannelView {
+        let point = |&(value, opacity): &(f32, f32)| OpacityPoint { value, opacity };
+        let transfer = TransferFunction {
+            polarity,
+            color_map: ColorMap::Gray,
+            window,
+            opacity: points.iter().map(point).collect(),
+            opacity_length_nm: 100.0,
+        };
+        ChannelView {
+            iso: 0.3,
+            significant_bits: 12,
+            ..ChannelView::new(0, transfer)
+        }
+    }
+
+    fn table(view: &ChannelView, dtype: Dtype) -> TransferTable {
+        TransferTable::new(view, dtype, Mode::EmissionAbsorption)
+    }
+
+    #[test]
+    fn eight_bit_has_an_entry_per_value() {
+        for polarity in [Polarity::Bright, Polarity::Dark] {
+            let view = view(polarity, &[(0.25, 0.8), (0.75, 0.0)], [0.0, 1.0]);
+            let table = table(&view, Dtype::Uint8);
+            assert_eq!((table.scale, table.offset), (1.0, 0.0));
+            let want = view.transfer.table();
+            for (got, want) in table.storage.colors.iter().zip(&want) {
+                assert!((0..3).all(|c| (got[c] - want[c]).abs() < 1e-6));
+                let extinction = -(-want[3]).ln_1p() / 100.0;
+                assert!((got[3] - extinction).abs() <= 1e-6 * extinction);
+            }
+        }
+    }
+
+    /// A table over the window is as fine there as one over all values is where it is wide.
+    #[test]
+    fn a_narrow_window_of_sixteen_bit_is_smooth() {
+        for polarity in [Polarity::Bright, Polarity::Dark] {
+            let at = |counts: f32| counts / 65_535.0;
+            let points = [(at(300.0), 0.0), (at(1300.0), 0.9)];
+            let mut view = view(polarity, &points, [at(200.0), at(1400.0)]);
+            view.iso = at(800.0);
+            let table = table(&view, Dtype::Uint16);
+            for measured in (1..3000_u16).step_by(7) {
+                let stored = match polarity {
+                    Polarity::Bright => measured,
+                    Polarity::Dark => measured.wrapping_neg(),
+                };
+                let x = (f32::from(stored) * table.scale + table.offset).clamp(0.0, 255.0);
+                let (low, t) = (x.floor().min(254.0), x - x.floor().min(254.0));
+                let [a, b] = [low, low + 1.0].map(|i| table.storage.colors[i as usize][3]);
+                let want = extinction(&view.transfer, f64::from(at(f32::from(measured)))) as f32;
+                let got = a + t * (b - a);
+                let off = (got - want).abs();
+                assert!(off < 3e-4, "{polarity:?} {measured}: {got} not {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_hidden_is_transparent_everywhere() {
+        let at = |counts: f32| counts / 65_535.0;
+        let points = [(at(999.5), 0.0), (at(1000.5), 0.5), (at(4000.0), 0.0)];
+        let view = view(Polarity::Bright, &points, [0.0, at(9000.0)]);
+        let table = table(&view, Dtype::Uint16);
+        assert!(table.hides(0, 900) && table.hides(5000, 65_535));
+        assert!(!table.hides(0, 1100) && !table.hides(1000, 1000) && !table.hides(3000, 65_535));
+        // Bins of 128 values each.
+        let seen = table.storage.visible_bins;
+        assert_eq!((seen & 0b111_1111, seen >> 8 & 1), (0, 1), "{seen:b}");
+    }
+
+    #[test]
+    fn surfaces_hide_what_is_below() {
+        for (dtype, largest) in [(Dtype::Uint8, 255.0_f32), (Dtype::Uint16, 65_535.0)] {
+            for polarity in [Polarity::Bright, Polarity::Dark] {
+                let view = view(polarity, &[(0.0, 1.0)], [0.0, 1.0]);
+                let table = TransferTable::new(&view, dtype, Mode::IsoSurface);
+                let iso = (table.storage.iso * largest).round() as u16;
+                let step = (largest / 100.0).ceil() as u16;
+                assert!(table.hides(0, iso - step), "{dtype:?} {polarity:?}");
+                assert!(!table.hides(0, iso + 1) && !table.hides(iso + 1, iso + 1));
+            }
+        }
+    }
+
+    #[test]
+    fn opacity_of_no_length_is_not_infinite() {
+        let mut view = view(Polarity::Bright, &[(0.0, 0.5)], [0.0, 1.0]);
+        view.transfer.opacity_length_nm = 100.0;
+        let storage = table(&view, Dtype::Uint8).storage;
+        assert_eq!(
+            (storage.colors[0][3], storage.opaque_before[TABLE_LEN]),
+            (0.0, 255)
+        );
+        assert!((storage.colors[9][3] - 0.5_f32.ln().abs() / 100.0).abs() < 1e-6);
+        for length in [0.0, -1.0, f64::NAN, 1e-300] {
+            view.transfer.opacity_length_nm = length;
+            for dtype in [Dtype::Uint8, Dtype::Uint16] {
+                let colors = table(&view, dtype).storage.colors;
+                assert!(colors.iter().flatten().all(|c| c.is_finite()), "{length}");
+            }
+        }
+    }
+}

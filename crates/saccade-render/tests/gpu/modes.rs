@@ -1,0 +1,314 @@
+//! Ways to draw, and what is cut away.
+
+use glam::{DVec3, UVec2};
+use saccade_core::camera::Camera;
+use saccade_core::space::Point;
+use saccade_render::{
+    Clip, Gpu, HalfSpace, Heat, Image, Mode, Renderer, RendererOptions, Slab, Traversal, View, Work,
+};
+
+use crate::harness::{frame, gpu, keep, psnr, read, settle};
+use crate::oracle::{self, Cut};
+use crate::scene::{Scene, specks, stained, tissue, waves};
+
+const SIZE: UVec2 = UVec2::new(72, 56);
+
+fn picture(gpu: &Gpu, scene: &Scene, view: &View, traversal: Traversal) -> Image {
+    let options = RendererOptions {
+        traversal,
+        ..RendererOptions::default()
+    };
+    let mut renderer = Renderer::new(gpu, scene.volume.clone(), options).unwrap();
+    renderer.set_channels(&scene.views()).unwrap();
+    settle(&mut renderer, view, scene);
+    read(&renderer)
+}
+
+fn compare(gpu: &Gpu, name: &str, scene: &Scene, view: &View, least: f64) {
+    let want = oracle::render(scene, view, Cut::HalfVoxels);
+    keep(&format!("{name}-oracle"), &want);
+    for traversal in [Traversal::ResidencyOctree, Traversal::PageTables] {
+        let got = picture(gpu, scene, view, traversal);
+        keep(&format!("{name}-{traversal:?}"), &got);
+        let db = psnr(&got, &want);
+        assert!(db >= least, "{name}, {traversal:?}: {db:.1} dB");
+    }
+}
+
+fn views(scene: &Scene) -> [View; 2] {
+    let around = Camera::around(&scene.volume);
+    [around.zoomed(1.4), around.zoomed(5.0)].map(|camera| View {
+        background: [0.1, 0.2, 0.4],
+        ..View::new(camera, SIZE)
+    })
+}
+
+#[test]
+fn the_largest_value_is_drawn() {
+    let Some(gpu) = gpu() else { return };
+    for (name, scene) in [
+        ("waves", waves()),
+        ("tissue", tissue()),
+        ("stained", stained()),
+    ] {
+        for (which, view) in views(&scene).into_iter().enumerate() {
+            let view = View {
+                mode: Mode::Maximum,
+                ..view
+            };
+            compare(
+                &gpu,
+                &format!("maximum-{name}-{which}"),
+                &scene,
+                &view,
+                45.0,
+            );
+        }
+    }
+}
+
+#[test]
+fn surfaces_are_where_values_pass() {
+    let Some(gpu) = gpu() else { return };
+    let mut waves = waves();
+    waves.iso = 150.0;
+    let mut tissue = tissue();
+    tissue.iso = 90.0;
+    let mut stained = stained();
+    stained.iso = 160.0;
+    for (name, scene) in [("waves", waves), ("tissue", tissue), ("stained", stained)] {
+        for (which, view) in views(&scene).into_iter().enumerate() {
+            let view = View {
+                mode: Mode::IsoSurface,
+                ..view
+            };
+            // At edges a hair's breadth decides between a surface and the background.
+            compare(
+                &gpu,
+                &format!("surface-{name}-{which}"),
+                &scene,
+                &view,
+                30.0,
+            );
+        }
+    }
+}
+
+#[test]
+fn surfaces_move_with_their_value() {
+    let Some(gpu) = gpu() else { return };
+    let mut scene = waves();
+    let [view, _] = views(&scene);
+    let view = View {
+        mode: Mode::IsoSurface,
+        ..view
+    };
+    scene.iso = 150.0;
+    let got = picture(&gpu, &scene, &view, Traversal::ResidencyOctree);
+    let mut off = |iso| {
+        scene.iso = iso;
+        psnr(&got, &oracle::render(&scene, &view, Cut::HalfVoxels))
+    };
+    let there = off(150.0);
+    for iso in [144.0, 156.0] {
+        let db = off(iso);
+        assert!(
+            db < there - 6.0,
+            "at {iso} it looks the same: {db:.1} of {there:.1} dB"
+        );
+    }
+}
+
+fn clips(scene: &Scene) -> Vec<(&'static str, Clip)> {
+    let size = scene.volume.size_nm();
+    let at = |share: DVec3| Point::new(size * share);
+    let corner = [at(DVec3::new(0.9, 0.2, 0.8)), at(DVec3::new(0.3, 0.7, 0.1))];
+    let half = |point, normal| {
+        Some(HalfSpace {
+            point: at(point),
+            normal,
+        })
+    };
+    let middle = DVec3::splat(0.5);
+    vec![
+        (
+            "box",
+            Clip {
+                within: Some(corner),
+                ..Clip::default()
+            },
+        ),
+        (
+            "planes",
+            Clip {
+                half_spaces: [
+                    half(middle, DVec3::new(-0.3, 0.1, -2.0)),
+                    half(middle, DVec3::X),
+                    None,
+                    half(DVec3::ZERO, DVec3::ZERO),
+                ],
+                ..Clip::default()
+            },
+        ),
+        (
+            "slab",
+            Clip {
+                slab: Some(Slab {
+                    point: at(middle),
+                    normal: DVec3::new(0.2, 0.3, 1.0),
+                    thickness_nm: 90.0,
+                }),
+                ..Clip::default()
+            },
+        ),
+    ]
+}
+
+#[test]
+fn what_is_clipped_is_not_there() {
+    let Some(gpu) = gpu() else { return };
+    let scene = waves();
+    for mode in [Mode::EmissionAbsorption, Mode::Maximum] {
+        let [view, _] = views(&scene);
+        let view = View { mode, ..view };
+        let whole = oracle::render(&scene, &view, Cut::HalfVoxels);
+        for (name, clip) in clips(&scene) {
+            let view = View { clip, ..view };
+            compare(&gpu, &format!("clip-{name}-{mode:?}"), &scene, &view, 40.0);
+            let db = psnr(&whole, &oracle::render(&scene, &view, Cut::HalfVoxels));
+            assert!(db < 30.0, "{name} takes nothing away: {db:.1} dB");
+        }
+    }
+}
+
+/// A slice shows what voxels are on it, whatever is before and behind.
+#[test]
+fn a_slice_has_one_sample_a_ray() {
+    let Some(gpu) = gpu() else { return };
+    let scene = tissue();
+    let size = scene.volume.size_nm();
+    for (name, normal) in [("axis", DVec3::Z), ("oblique", DVec3::new(0.4, 0.2, 1.0))] {
+        let slab = Slab {
+            point: Point::new(size / 2.0),
+            normal,
+            thickness_nm: 0.0,
+        };
+        let [view, _] = views(&scene);
+        let view = View {
+            mode: Mode::Maximum,
+            clip: Clip {
+                slab: Some(slab),
+                ..Clip::default()
+            },
+            ..view
+        };
+        // The oracle draws no ray of no length.
+        let thin = View {
+            clip: Clip {
+                slab: Some(Slab {
+                    thickness_nm: 1e-3,
+                    ..slab
+                }),
+                ..Clip::default()
+            },
+            ..view
+        };
+        let options = RendererOptions {
+            traversal: Traversal::PageTables,
+            ..RendererOptions::default()
+        };
+        let mut renderer = Renderer::new(&gpu, scene.volume.clone(), options).unwrap();
+        renderer.set_channels(&scene.views()).unwrap();
+        let reports = settle(&mut renderer, &view, &scene);
+        let statistics = reports.last().unwrap().statistics;
+        assert!(statistics.samples <= statistics.rays, "{statistics:?}");
+        assert!(
+            statistics.samples > SIZE.element_product() / 8,
+            "{statistics:?}"
+        );
+        let got = read(&renderer);
+        keep(&format!("slice-{name}"), &got);
+        let db = psnr(&got, &oracle::render(&scene, &thin, Cut::HalfVoxels));
+        assert!(db >= 38.0, "{name}: {db:.1} dB");
+    }
+}
+
+#[test]
+fn planes_that_make_no_sense_do_no_harm() {
+    let Some(gpu) = gpu() else { return };
+    let scene = waves();
+    let [view, _] = views(&scene);
+    let whole = picture(&gpu, &scene, &view, Traversal::ResidencyOctree);
+    let slab = |normal, thickness_nm| {
+        let point = Point::new(scene.volume.size_nm() / 2.0);
+        Clip {
+            slab: Some(Slab {
+                point,
+                normal,
+                thickness_nm,
+            }),
+            ..Clip::default()
+        }
+    };
+    let nowhere = [Point::new(DVec3::splat(1e9)), Point::new(DVec3::splat(2e9))];
+    let far = Clip {
+        within: Some(nowhere),
+        ..Clip::default()
+    };
+    let broken = Clip {
+        half_spaces: [
+            Some(HalfSpace {
+                point: Point::new(DVec3::NAN),
+                normal: DVec3::X,
+            }),
+            None,
+            None,
+            None,
+        ],
+        ..Clip::default()
+    };
+    for (clip, shows) in [
+        (slab(DVec3::ZERO, 1.0), true),
+        (slab(DVec3::X, f64::NAN), false),
+        (slab(DVec3::X * 1e200, 1e200), true),
+        (far, false),
+        (broken, false),
+    ] {
+        for mode in [Mode::EmissionAbsorption, Mode::IsoSurface] {
+            let view = View { clip, mode, ..view };
+            let got = picture(&gpu, &scene, &view, Traversal::ResidencyOctree);
+            if mode == Mode::EmissionAbsorption {
+                assert_eq!(psnr(&got, &whole) > 60.0, shows, "{clip:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn heat_shows_the_work_of_rays() {
+    let Some(gpu) = gpu() else { return };
+    let scene = specks();
+    let [view, _] = views(&scene);
+    let mut renderer = Renderer::new(&gpu, scene.volume.clone(), Default::default()).unwrap();
+    renderer.set_channels(&scene.views()).unwrap();
+    settle(&mut renderer, &view, &scene);
+    for of in [Work::Lookups, Work::Nodes, Work::Samples] {
+        let heat = |full| View {
+            heat: Some(Heat { of, full }),
+            ..view
+        };
+        let mut light = Vec::new();
+        for full in [10.0, 100.0] {
+            let report = frame(&mut renderer, &heat(full));
+            let statistics = report.statistics;
+            let [fewest, most] = statistics.lookups_per_ray;
+            assert!(statistics.rays > 0 && fewest <= most, "{statistics:?}");
+            assert!(u64::from(statistics.lookups) <= u64::from(statistics.rays) * u64::from(most));
+            assert!(statistics.lookups >= statistics.rays * fewest);
+            let picture = read(&renderer);
+            keep(&format!("heat-{of:?}-{full}"), &picture);
+            light.push(picture.rgba.iter().map(|&v| u64::from(v)).sum::<u64>());
+        }
+        assert!(light[0] > light[1], "{of:?}: {light:?}");
+    }
+}
