@@ -11,15 +11,29 @@ const TICKS_PER_SECOND: u64 = 100;
 /// Processor time, user and system, of all threads so far.
 pub(crate) fn time() -> Result<Duration> {
     let stat = fs::read_to_string("/proc/self/stat").context("processor time needs /proc")?;
-    let ticks = parse(&stat).context("/proc/self/stat has an unknown form")?;
+    in_time(parse(&stat, OURS))
+}
+
+/// The same of all programs that this process started and that have ended.
+pub(crate) fn of_children() -> Result<Duration> {
+    let stat = fs::read_to_string("/proc/self/stat").context("processor time needs /proc")?;
+    in_time(parse(&stat, CHILDREN))
+}
+
+fn in_time(ticks: Option<u64>) -> Result<Duration> {
+    let ticks = ticks.context("/proc/self/stat has an unknown form")?;
     Ok(Duration::from_millis(ticks * 1000 / TICKS_PER_SECOND))
 }
 
-/// Sum of the fields `utime` and `stime`. They are counted from behind the command's name, which
+/// Fields between the command's name and the times of the process, and those of its children.
+const OURS: usize = 11;
+const CHILDREN: usize = 13;
+
+/// Sum of a time of the user's and one of the system's, after `skip` fields. They are counted from behind the command's name, which
 /// may hold spaces.
-fn parse(stat: &str) -> Option<u64> {
+fn parse(stat: &str, skip: usize) -> Option<u64> {
     let (_, fields) = stat.rsplit_once(')')?;
-    let mut fields = fields.split_whitespace().skip(11);
+    let mut fields = fields.split_whitespace().skip(skip);
     let user: u64 = fields.next()?.parse().ok()?;
     let system: u64 = fields.next()?.parse().ok()?;
     Some(user + system)
@@ -32,7 +46,8 @@ mod tests {
     #[test]
     fn user_and_system_are_added_whatever_the_command_is_called() {
         let stat = "12 (a ) b) R 1 2 3 4 5 6 7 8 9 10 70 7 0 0 20 0 3 0 99";
-        assert_eq!(parse(stat), Some(77));
-        assert_eq!(parse("12 (a) R 1 2"), None);
+        assert_eq!(parse(stat, OURS), Some(77));
+        assert_eq!(parse(stat, CHILDREN), Some(0));
+        assert_eq!(parse("12 (a) R 1 2", OURS), None);
     }
 }

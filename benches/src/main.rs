@@ -14,6 +14,7 @@ mod clock;
 mod cpu;
 mod dense;
 mod machine;
+mod memory;
 mod report;
 mod rows;
 mod scene;

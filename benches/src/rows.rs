@@ -30,6 +30,14 @@ pub(crate) static GROUPS: &[Group] = &[
         measure: ingest::measure,
     },
     Group {
+        ids: ingest::MEMORY_IDS,
+        measure: ingest::measure_memory,
+    },
+    Group {
+        ids: ingest::SIMULATE_IDS,
+        measure: ingest::simulate,
+    },
+    Group {
         ids: construct::IDS,
         measure: construct::measure,
     },

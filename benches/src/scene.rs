@@ -121,11 +121,6 @@ impl Mosaic {
         u64::from(self.side).pow(2) * u64::from(self.sections)
     }
 
-    /// Pixels of all tiles.
-    pub(crate) fn pixels(self) -> u64 {
-        u64::from(self.edge).pow(2) * self.tiles()
-    }
-
     /// Extent that is covered everywhere \[voxels\].
     pub(crate) fn extent(self) -> UVec3 {
         let side = self.side * self.pitch();

@@ -13,10 +13,16 @@
 //! 16 bits spreads 8 over the whole range, exactly (times 257). Labels are numbers, not shades: none is
 //! spread, averaged or read out of a lossy file.
 //!
-//! Files may be hostile: no panic, and no more memory than a file of that many bytes can fill.
+//! Files may be hostile: no panic, and memory is set aside only for a size that the caller expects
+//! ([`Wanted::size`]), or, where none is expected, for one that a file of that many bytes can fill.
+//! A TIFF is read as it is decoded, so that its pixels are in memory once; other files are read whole, and
+//! refused where they are longer than [`Wanted::size`] can explain.
 
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 
+use glam::UVec2;
 use saccade_core::volume::Dtype;
 use sniff::Kind;
 
@@ -79,6 +85,8 @@ pub struct Wanted {
     pub dtype: Dtype,
     /// Whether they are labels, which are kept as they are.
     pub labels: bool,
+    /// The only size that will do, if it is known; another is refused before any pixel \[pixels\].
+    pub size: Option<UVec2>,
 }
 
 impl Wanted {
@@ -86,11 +94,13 @@ impl Wanted {
     pub const GRAY_8: Self = Self {
         dtype: Dtype::Uint8,
         labels: false,
+        size: None,
     };
     /// Grey of 16 bits.
     pub const GRAY_16: Self = Self {
         dtype: Dtype::Uint16,
         labels: false,
+        size: None,
     };
 
     /// Refuses images of other bits than fit the volume.
@@ -103,6 +113,29 @@ impl Wanted {
                 volume: 8 * u32::try_from(self.dtype.bytes()).unwrap_or(1),
             })
         }
+    }
+
+    /// The number of pixels, if it is one that a tile can have, and this one.
+    fn check_size(self, width: u32, height: u32) -> Result<usize, ImageError> {
+        if let Some(want) = self.size
+            && want != UVec2::new(width, height)
+        {
+            return Err(ImageError::Size {
+                width,
+                height,
+                want,
+            });
+        }
+        check_size(width, height)
+    }
+
+    /// The longest file, read whole, that can hold such an image \[bytes\]: four channels of 16 bits
+    /// that did not compress at all, twice, and descriptions.
+    fn longest_file(self) -> u64 {
+        let pixels = self.size.map_or(MAX_PIXELS, |size| {
+            u64::from(size.x).saturating_mul(size.y.into())
+        });
+        pixels.saturating_mul(16).saturating_add(64 << 20)
     }
 
     /// An image of 8 bits as what is wanted.
@@ -174,6 +207,31 @@ pub enum ImageError {
         /// Bits that the volume has.
         volume: u32,
     },
+    /// Another size than the caller expects.
+    #[error(
+        "the image has {width} x {height} pixels, but its record says {} x {}; mend the record or the \
+         image",
+        want.x, want.y
+    )]
+    Size {
+        /// Pixels along x.
+        width: u32,
+        /// Pixels along y.
+        height: u32,
+        /// What was expected \[pixels\].
+        want: UVec2,
+    },
+    /// A file that no image of its size needs.
+    #[error(
+        "the file has {bytes} bytes, more than {most} that an image of its size can need; write it \
+         without what else is in it"
+    )]
+    TooLong {
+        /// Its length \[bytes\].
+        bytes: u64,
+        /// Most that could be \[bytes\].
+        most: u64,
+    },
     /// A pixel is not grey.
     #[error(
         "the image is in colour (red, green, blue are {rgb:?} at pixel {x}, {y}), but the volume is \
@@ -234,7 +292,7 @@ pub fn decode(bytes: &[u8]) -> Result<GrayImage, ImageError> {
 /// [`ImageError`].
 pub fn decode_as(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     match sniff::kind(bytes)? {
-        Kind::Tiff => tiff::decode(bytes, wanted),
+        Kind::Tiff => tiff::decode(Cursor::new(bytes), bytes.len() as u64, wanted),
         Kind::Png => png::decode(bytes, wanted),
         Kind::Jpeg => jpeg::decode(bytes, wanted),
     }
@@ -255,11 +313,28 @@ pub fn decode_file(path: &Path) -> Result<GrayImage, ImageError> {
 ///
 /// [`ImageError`].
 pub fn decode_file_as(path: &Path, wanted: Wanted) -> Result<Image, ImageError> {
-    let read = std::fs::read(path);
-    let bytes = read.map_err(|source| ImageError::Read {
+    let failed = |source| ImageError::Read {
         source,
         path: path.to_owned(),
-    })?;
+    };
+    let mut file = File::open(path).map_err(failed)?;
+    let len = file.metadata().map_err(failed)?.len();
+    let mut head = Vec::new();
+    file.by_ref()
+        .take(sniff::HEAD)
+        .read_to_end(&mut head)
+        .map_err(failed)?;
+    if sniff::kind(&head)? == Kind::Tiff {
+        file.rewind().map_err(failed)?;
+        return tiff::decode(BufReader::with_capacity(READ_AHEAD, file), len, wanted);
+    }
+    let most = wanted.longest_file();
+    if len > most {
+        return Err(ImageError::TooLong { bytes: len, most });
+    }
+    // It may still grow.
+    let mut bytes = head;
+    file.take(most).read_to_end(&mut bytes).map_err(failed)?;
     decode_as(&bytes, wanted)
 }
 
@@ -272,6 +347,9 @@ fn of_8_bits(image: Image) -> Result<GrayImage, ImageError> {
         }),
     }
 }
+
+/// Bytes of a TIFF that are read at once.
+const READ_AHEAD: usize = 1 << 20;
 
 /// The number of pixels, if it is one that a tile can have.
 fn check_size(width: u32, height: u32) -> Result<usize, ImageError> {

@@ -3,7 +3,7 @@
 use turbojpeg::{Colorspace, Decompressor, Image, PixelFormat};
 
 use super::sniff::{broken, check_jpeg};
-use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, check_size, gray};
+use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, gray};
 
 /// Progressive files may refine the image as often as they like; this many times are enough.
 const MAX_SCANS: u32 = 500;
@@ -24,7 +24,7 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Decoded, ImageError
     let header = decoder.read_header(bytes).map_err(broken)?;
     let size = |len: usize| u32::try_from(len).map_err(broken);
     let (width, height) = (size(header.width)?, size(header.height)?);
-    let pixels = check_size(width, height)?;
+    let pixels = wanted.check_size(width, height)?;
     /// A block of 64 pixels takes two bits at least; runs of empty ones take less in refining
     /// scans, but the first still names each row of blocks.
     const MAX_RATIO: usize = 1 << 15;

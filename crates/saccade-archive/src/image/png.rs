@@ -6,7 +6,7 @@ use png::{BitDepth, ColorType, Decoder, DecodingError, Transformations};
 
 use super::sniff::{broken, check_png, incomplete};
 use super::tiff::unpack;
-use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, check_size, gray};
+use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, gray};
 
 pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     check_png(bytes)?;
@@ -19,7 +19,7 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> 
     });
     let mut reader = decoder.read_info().map_err(sort)?;
     let (width, height) = (reader.info().width, reader.info().height);
-    let pixels = check_size(width, height)?;
+    let pixels = wanted.check_size(width, height)?;
     let (color, depth) = reader.output_color_type();
     let bits = depth as usize;
     wanted.check(depth as u32)?;

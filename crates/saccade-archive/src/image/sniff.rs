@@ -24,6 +24,9 @@ pub(super) fn broken(reason: impl ToString) -> ImageError {
     }
 }
 
+/// Bytes of a file's beginning that are enough to tell.
+pub(super) const HEAD: u64 = 16;
+
 /// The kind of a file.
 pub(super) fn kind(bytes: &[u8]) -> Result<Kind, ImageError> {
     let known: [(&[u8], Kind); 6] = [

@@ -2,27 +2,42 @@
 //!
 //! The decoder below turns white-is-zero round itself, whatever the bits; a test holds it to that.
 
-use std::io::{self, Cursor};
+use std::io::{self, Read, Seek};
 
 use tiff::decoder::{Decoder, Limits};
 use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
 
-use super::sniff::{broken, incomplete};
-use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, check_size, gray};
+mod lzw;
 
-pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
-    check_header(bytes)?;
+use super::sniff::{HEAD, broken, incomplete};
+use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, gray};
+
+/// What a file is read from.
+trait ReadSeek: Read + Seek {}
+
+impl<T: Read + Seek> ReadSeek for T {}
+
+/// Decodes a file of `len` bytes, from its beginning on.
+pub(super) fn decode(
+    mut file: impl Read + Seek,
+    len: u64,
+    wanted: Wanted,
+) -> Result<Image, ImageError> {
+    let mut head = Vec::new();
+    let read = file.by_ref().take(HEAD).read_to_end(&mut head);
+    read.and_then(|_| file.rewind())
+        .map_err(|e| sort(e.into()))?;
+    check_header(&head)?;
+    let stored = usize::try_from(len).unwrap_or(usize::MAX);
     let mut limits = Limits::default();
     // What a file holds is no longer than the file; the image is given its memory below.
-    limits.ifd_value_size = bytes.len();
-    limits.intermediate_buffer_size = bytes.len();
-    limits.decoding_buffer_size = bytes.len().max(1 << 20);
-    let mut decoder = Decoder::new(Cursor::new(bytes))
-        .map_err(sort)?
-        .with_limits(limits);
+    limits.ifd_value_size = stored;
+    limits.intermediate_buffer_size = stored;
+    limits.decoding_buffer_size = stored.max(1 << 20);
+    let mut decoder = Decoder::new(file).map_err(sort)?.with_limits(limits);
     let (width, height) = decoder.dimensions().map_err(sort)?;
-    let pixels = check_size(width, height)?;
+    let pixels = wanted.check_size(width, height)?;
     check_samples(&mut decoder)?;
     let (channels, bits) = match decoder.colortype().map_err(sort)? {
         ColorType::Gray(bits @ (1 | 2 | 4 | 8 | 16)) => (1, bits),
@@ -47,14 +62,20 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> 
     if wanted.labels && channels > 1 {
         return Err(unsupported("labels in several channels"));
     }
-    check_data(&mut decoder, bytes.len() as u64)?;
+    check_data(&mut decoder, len)?;
     let layout = decoder.image_buffer_layout().map_err(sort)?;
     // Rows begin on whole bytes.
     let row = (width as usize * channels * usize::from(bits)).div_ceil(8);
     if layout.len != row * height as usize || layout.complete_len != layout.len {
         return Err(unsupported("a TIFF of several planes"));
     }
-    check_ratio(bytes.len(), layout.len)?;
+    check_ratio(stored, layout.len)?;
+    if let Some(plain) = lzw::unpacked(&mut decoder, layout.len)? {
+        let len = plain.len() as u64;
+        // By name: a type that contains itself has no end.
+        let plain: Box<dyn ReadSeek> = Box::new(io::Cursor::new(plain));
+        return decode(plain, len, wanted);
+    }
     if bits == 16 {
         let mut samples = allocate::<u16>(layout.len / 2)?;
         // In this machine's order of bytes.
@@ -101,7 +122,7 @@ pub(super) fn unpack(
 }
 
 /// Refuses what the decoder below would read as something else than it is, or not explain.
-fn check_samples(decoder: &mut Decoder<Cursor<&[u8]>>) -> Result<(), ImageError> {
+fn check_samples(decoder: &mut Decoder<impl Read + Seek>) -> Result<(), ImageError> {
     let mut value = |tag| {
         let values = decoder.find_tag_unsigned_vec::<u64>(tag).map_err(sort)?;
         Ok::<_, ImageError>(values.and_then(|values| values.first().copied()))
@@ -140,7 +161,7 @@ fn check_header(bytes: &[u8]) -> Result<(), ImageError> {
 }
 
 /// Checks that all strips or tiles lie within the file.
-fn check_data(decoder: &mut Decoder<Cursor<&[u8]>>, len: u64) -> Result<(), ImageError> {
+fn check_data(decoder: &mut Decoder<impl Read + Seek>, len: u64) -> Result<(), ImageError> {
     let mut values = |tags: [Tag; 2]| {
         for tag in tags {
             if let Some(values) = decoder.find_tag_unsigned_vec::<u64>(tag).map_err(sort)? {
@@ -185,6 +206,8 @@ fn sort(e: TiffError) -> ImageError {
         TiffError::IoError(e) if e.kind() == io::ErrorKind::UnexpectedEof => {
             incomplete("it ends early")
         }
+        // A share that fails for a moment; the pixels themselves are never told this way.
+        TiffError::IoError(e) if e.raw_os_error().is_some() => incomplete(e.to_string()),
         TiffError::UnsupportedError(e) => unsupported(e.to_string()),
         e => broken(e),
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
-use glam::UVec3;
+use glam::{UVec2, UVec3};
 use saccade_archive::acquisition::{
     DeleteRecord, TileRecord, TransformRecord, VoxelKind, image_path,
 };
@@ -103,8 +103,9 @@ impl Stored {
         (stored, why)
     }
 
-    fn wanted(self) -> Wanted {
+    fn wanted(self, size: UVec2) -> Wanted {
         Wanted {
+            size: Some(size),
             dtype: self.dtype,
             labels: self.kind == VoxelKind::Labels,
         }
@@ -256,19 +257,12 @@ fn build(path: &Path, record: &TileRecord, stored: Stored) -> Result<Bytes, Refu
                       there, and append the record again";
         return Err(Refusal::Never(reason.to_owned()));
     }
-    let image = image::decode_file_as(path, stored.wanted()).map_err(|e| match e {
+    let image = image::decode_file_as(path, stored.wanted(record.size)).map_err(|e| match e {
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
         ImageError::Broken { .. } => Refusal::Broken(e.to_string()),
         ImageError::Read { ref source, .. } => Refusal::Incomplete(format!("{e}: {source}")),
         _ => Refusal::Never(e.to_string()),
     })?;
-    let [width, height] = image.size();
-    if [width, height] != record.size.to_array() {
-        return Err(Refusal::Never(format!(
-            "the image has {} x {} pixels, but its record says {} x {}; mend the record or the image",
-            width, height, record.size.x, record.size.y,
-        )));
-    }
     stored
         .encode(&image)
         .map_err(|e| Refusal::Never(e.to_string()))
@@ -359,7 +353,6 @@ fn with_sources(error: &(dyn std::error::Error + 'static)) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::UVec2;
     use saccade_archive::storage::check_name;
     use saccade_core::transform::SectionFromTile;
 

@@ -1,0 +1,52 @@
+//! Resident memory of this process.
+
+use std::fs;
+
+use anyhow::{Context, Result};
+
+/// Forgets the highest so far; what is resident now \[bytes\].
+pub(crate) fn reset_peak() -> Result<u64> {
+    // Documented in proc(5): 5 resets the peak.
+    fs::write("/proc/self/clear_refs", "5").context("peaks of memory need Linux's /proc")?;
+    of("VmRSS")
+}
+
+/// The highest since the last reset \[bytes\].
+pub(crate) fn peak() -> Result<u64> {
+    of("VmHWM")
+}
+
+fn of(key: &str) -> Result<u64> {
+    let status = fs::read_to_string("/proc/self/status")?;
+    parse(&status, key).with_context(|| format!("/proc/self/status has no {key}"))
+}
+
+fn parse(status: &str, key: &str) -> Option<u64> {
+    let value = status
+        .lines()
+        .find_map(|line| line.strip_prefix(key)?.strip_prefix(':'))?;
+    let kib: u64 = value.trim().strip_suffix(" kB")?.parse().ok()?;
+    Some(kib * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kibibytes_become_bytes() {
+        let status = "Name:\tx\nVmHWM:\t  12 kB\nVmRSS:\t 7 kB\n";
+        assert_eq!(parse(status, "VmHWM"), Some(12 << 10));
+        assert_eq!(parse(status, "VmRSS"), Some(7 << 10));
+        assert_eq!(parse(status, "Vm"), None);
+    }
+
+    #[test]
+    fn a_peak_stays_until_it_is_reset() {
+        let before = reset_peak().unwrap();
+        drop(std::hint::black_box(vec![1_u8; 64 << 20]));
+        assert!(peak().unwrap() >= before + (60 << 20));
+        assert!(reset_peak().unwrap() < before + (32 << 20));
+        assert!(peak().unwrap() < before + (32 << 20));
+    }
+}
