@@ -40,7 +40,7 @@ pub async fn offer_archive(
         if offered.contains(&name) {
             continue;
         }
-        let source = StitchedSource::open(archive, &name, options).await?;
+        let source = StitchedSource::open(archive, &name, options.clone()).await?;
         let status = CatalogStatus::new(archive.catalog().clone(), &name);
         volumes.publish(Arc::new(source), Some(Arc::new(status)));
         new.push(name);
@@ -57,7 +57,7 @@ pub async fn follow_archive(
 ) {
     loop {
         tokio::time::sleep(poll).await;
-        match offer_archive(volumes, archive, options).await {
+        match offer_archive(volumes, archive, options.clone()).await {
             Ok(new) => new
                 .iter()
                 .for_each(|name| log::info!("volume {name:?} is offered now")),

@@ -42,6 +42,7 @@ mod blocks;
 mod build;
 mod canvas;
 mod coverage;
+mod disk_cache;
 mod error;
 mod follow;
 mod index;
@@ -49,6 +50,7 @@ mod resample;
 mod tiles;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use glam::UVec2;
@@ -70,12 +72,13 @@ use tiles::Tiles;
 
 pub use along_z::{AlongZ, Gaps};
 pub use coverage::Overlaps;
+pub use disk_cache::{DiskCache, DiskCacheError};
 pub use error::StitchError;
 pub use index::{SectionIndex, TileIndex, TileUpdate};
 pub use resample::{Interpolation, Patch, Sample};
 
 /// How a [`StitchedSource`] stitches, and its limits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StitchedOptions {
     /// Memory for finished blocks \[bytes\].
     pub block_bytes: u64,
@@ -93,6 +96,9 @@ pub struct StitchedOptions {
     pub along_z: AlongZ,
     /// What is shown in place of sections that have no tile.
     pub gaps: Gaps,
+    /// Keeps finished blocks over restarts. For archives that can be written, which then get an object
+    /// `identity` that tells them from others.
+    pub disk_cache: Option<DiskCache>,
     /// How long chunks fail that show a tile which cannot be read, until it is tried again.
     pub try_again: Duration,
 }
@@ -107,6 +113,7 @@ impl Default for StitchedOptions {
             overlaps: Overlaps::NearestCentre,
             along_z: AlongZ::Nearest,
             gaps: Gaps::Empty,
+            disk_cache: None,
             try_again: Duration::from_secs(3),
             builds: std::thread::available_parallelism().map_or(2, usize::from),
         }
@@ -119,7 +126,9 @@ impl Default for StitchedOptions {
 pub struct StitchedStatistics {
     /// Blocks built since it was opened.
     pub blocks_built: u64,
-    /// Voxels of those blocks.
+    /// Blocks found in the cache on disk since it was opened.
+    pub blocks_from_disk: u64,
+    /// Voxels of those blocks that were built.
     pub voxels_built: u64,
     /// Pyramids opened since it was opened, also those opened again.
     pub pyramids_opened: u64,
@@ -154,6 +163,9 @@ struct Inner {
     blocks: Blocks,
     builder: Builder,
     builds: Arc<Semaphore>,
+    /// With what tells the archive from others.
+    disk: Option<(DiskCache, Vec<u8>)>,
+    from_disk: AtomicU64,
     changes: Arc<Changes>,
     runtime: Handle,
 }
@@ -197,7 +209,17 @@ impl StitchedSource {
         let volume = Arc::new(entry.volume);
         let index = TileIndex::open(&catalog, name).await.map_err(failed)?;
         let tiles = Tiles::new(archive, index, volume.dtype, &options);
+        let disk = match options.disk_cache.clone() {
+            Some(disk) => {
+                let place = catalog.path().display().to_string();
+                let identity = disk_cache::identity(&**archive.storage()).await;
+                identity.map(|identity| (disk, [&identity[..], place.as_bytes()].concat()))
+            }
+            None => None,
+        };
         let inner = Arc::new(Inner {
+            disk,
+            from_disk: AtomicU64::new(0),
             grid: BlockGrid::new(&volume),
             blocks: Blocks::new(options.block_bytes),
             builder: Builder::new(volume.clone(), tiles, &options),
@@ -254,6 +276,7 @@ impl StitchedSource {
     /// What it holds and has done.
     pub fn statistics(&self) -> StitchedStatistics {
         let mut statistics = self.inner.builder.statistics();
+        statistics.blocks_from_disk = self.inner.from_disk.load(Ordering::Relaxed);
         statistics.block_bytes = self.inner.blocks.bytes();
         statistics
     }

@@ -14,6 +14,7 @@ mod interrupt;
 mod open;
 mod progress;
 mod report;
+mod stitching;
 
 use std::process::ExitCode;
 

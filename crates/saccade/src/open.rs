@@ -10,8 +10,10 @@ use saccade_archive::VisualizationArchive;
 use saccade_serve::{CatalogStatus, StatusSource};
 use saccade_source::VolumeSource;
 use saccade_source::remote::{Quarantined, RemoteSource, Status, volumes};
-use saccade_source::stitched::{StitchedOptions, StitchedSource};
+use saccade_source::stitched::StitchedSource;
 use saccade_view::AcquisitionReader;
+
+use crate::stitching::Stitching;
 
 /// Where a volume is.
 #[derive(Clone, Debug)]
@@ -41,8 +43,8 @@ pub(crate) struct Opened {
 }
 
 impl Place {
-    /// Opens the volume of that name, or the first.
-    pub(crate) async fn open(&self, name: Option<&str>) -> Result<Opened> {
+    /// Opens the volume of that name, or the first; one of an archive is stitched as told.
+    pub(crate) async fn open(&self, name: Option<&str>, stitching: &Stitching) -> Result<Opened> {
         match self {
             Self::Server(address) => {
                 let name = match name {
@@ -75,7 +77,7 @@ impl Place {
                         ),
                     },
                 };
-                let options = StitchedOptions::default();
+                let options = stitching.options().await;
                 let source = StitchedSource::open(&archive, &name, options)
                     .await
                     .with_context(|| format!("cannot open a volume of {}", folder.display()))?;

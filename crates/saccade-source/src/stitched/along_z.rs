@@ -56,6 +56,15 @@ pub(super) enum Sections {
 }
 
 impl Sections {
+    /// All that may be looked at.
+    pub(super) fn all(&self) -> impl Iterator<Item = u32> {
+        let (first, then) = match self {
+            Self::FirstOf(sections) => (&**sections, &[][..]),
+            Self::Between(below, above, _) => (&**below, &**above),
+        };
+        first.iter().chain(then).copied()
+    }
+
     /// Of voxel `z` of a level: those it spans that have tiles, the one nearest its centre first, as
     /// far as they are looked at; or those around it.
     pub(super) fn of(

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bytes::Bytes;
+use bytes::{Buf, BufMut, Bytes, BytesMut};
 use glam::{DVec2, UVec2, UVec3};
 use saccade_core::levels::Level;
 use saccade_core::volume::Volume;
@@ -172,6 +172,57 @@ impl Block {
         let (at, size) = (at.as_usizevec3(), self.size.as_usizevec3());
         let index = (at.z * size.y + at.y) * size.x + at.x;
         self.chunks.get(index).unwrap_or(&CutChunk::Empty)
+    }
+
+    /// As bytes, for [`Self::from_bytes`]; `None` if there is nothing worth keeping, or a tile could not be
+    /// read.
+    pub(super) fn to_bytes(&self) -> Option<Bytes> {
+        if self.until.is_some() || self.chunks.is_empty() {
+            return None;
+        }
+        let mut bytes = BytesMut::with_capacity(usize::try_from(self.memory()).ok()?);
+        { self.size.to_array().into_iter() }.for_each(|n| bytes.put_u32_le(n));
+        for chunk in &self.chunks {
+            let (length, range) = match chunk {
+                CutChunk::Voxels(voxels, range) => (u32::try_from(voxels.len()).ok()?, *range),
+                CutChunk::Empty => (0, ValueRange { min: 0, max: 0 }),
+                CutChunk::Failed(_) => return None,
+            };
+            bytes.put_u32_le(length);
+            bytes.put_u16_le(range.min);
+            bytes.put_u16_le(range.max);
+        }
+        for chunk in &self.chunks {
+            if let CutChunk::Voxels(voxels, _) = chunk {
+                bytes.put_slice(voxels);
+            }
+        }
+        Some(bytes.freeze())
+    }
+
+    /// A block that was made bytes of; `None` if it was not. Its chunks share the bytes' memory.
+    pub(super) fn from_bytes(bytes: &Bytes) -> Option<Self> {
+        let mut table = bytes.clone();
+        let mut number = || table.try_get_u32_le().ok();
+        let size = UVec3::new(number()?, number()?, number()?);
+        let entries = usize::try_from(size.as_u64vec3().element_product()).ok()?;
+        let mut voxels = bytes.slice(entries.checked_mul(8)?.checked_add(12)?.min(bytes.len())..);
+        let mut chunks = Vec::new();
+        for _ in 0..entries {
+            let length = table.try_get_u32_le().ok()? as usize;
+            let min = table.try_get_u16_le().ok()?;
+            let max = table.try_get_u16_le().ok()?;
+            chunks.push(match length {
+                0 => CutChunk::Empty,
+                _ if length > voxels.len() => return None,
+                _ => CutChunk::Voxels(voxels.split_to(length), ValueRange { min, max }),
+            });
+        }
+        Some(Self {
+            size,
+            chunks,
+            until: None,
+        })
     }
 
     /// Whether it should be built again.

@@ -1,6 +1,7 @@
 //! Finished blocks, and those that are being built.
 
 use std::collections::HashMap;
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use futures::FutureExt;
@@ -14,6 +15,10 @@ use super::Inner;
 use super::block::{Block, BlockKey};
 use super::build::Place;
 use super::error::StitchError;
+
+/// Sections that a voxel of a block on disk spans, at most: to know whether it is still what it was, all of
+/// its tiles must be looked up, which of coarser blocks takes as long as building them.
+const MOST_SECTIONS: f64 = 16.0;
 
 type Built = Result<Arc<Block>, Arc<StitchError>>;
 type Building = BoxFuture<'static, Built>;
@@ -147,7 +152,7 @@ impl Inner {
                 level: key.level,
                 voxels: inner.grid.voxels(key),
             };
-            let built = inner.builder.block(&inner.grid, place).await;
+            let built = inner.kept_or_built(place).await;
             drop(permit);
             let block = Arc::new(built.map_err(Arc::new)?);
             landing.keep(&block);
@@ -159,6 +164,24 @@ impl Inner {
             ended.unwrap_or_else(|source| Err(Arc::new(StitchError::Stopped { source })))
         };
         building.boxed().shared()
+    }
+
+    /// A block from the cache on disk, or built now.
+    async fn kept_or_built(&self, place: Place) -> Result<Block, StitchError> {
+        let spans = self.volume.levels[place.level as usize].downsampling.z;
+        let Some((disk, identity)) = self.disk.as_ref().filter(|_| spans <= MOST_SECTIONS) else {
+            return self.builder.block(&self.grid, place, None).await;
+        };
+        let plan = self.builder.plan(place).await?;
+        let description = self.builder.description(place, &plan);
+        let description = [identity, description.as_bytes()].concat();
+        if let Some(block) = disk.get(&description).await {
+            self.from_disk.fetch_add(1, Ordering::Relaxed);
+            return Ok(block);
+        }
+        let block = self.builder.block(&self.grid, place, Some(&plan)).await?;
+        disk.put(&description, &block);
+        Ok(block)
     }
 
     /// Forgets all that shows level-0 voxels of a box.

@@ -1,5 +1,7 @@
 //! Builds the sections of a block.
 
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -39,7 +41,7 @@ pub(super) struct Builder {
 }
 
 /// How it is stitched.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Rules {
     pub(super) interpolation: Interpolation,
     pub(super) overlaps: Overlaps,
@@ -48,11 +50,18 @@ pub(super) struct Rules {
 }
 
 /// Voxels of one channel and level.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Place {
     pub(super) channel: u32,
     pub(super) level: u32,
     pub(super) voxels: VoxelBox,
+}
+
+/// What a block will be made of: the sections that its voxels look at, and their tiles near it.
+pub(super) struct Plan {
+    /// Of each z.
+    sections: Vec<Sections>,
+    near: BTreeMap<u32, Vec<Arc<IndexedTile>>>,
 }
 
 /// What one tile gives to a section of a block.
@@ -120,11 +129,37 @@ impl Builder {
         voxels
     }
 
-    /// Builds a block.
-    pub(super) async fn block(&self, grid: &BlockGrid, place: Place) -> Result<Block, StitchError> {
+    /// Makes a plan: it and the tiles' pyramids, which never change, say what the block will be.
+    pub(super) async fn plan(&self, place: Place) -> Result<Plan, StitchError> {
+        let (min, max) = Grid::of_level(self.level(place), place.voxels).bounds();
+        let z = place.voxels.min.z..place.voxels.max.z;
+        let sections: Vec<Sections> = z.map(|z| self.sections(place, z, None)).collect();
+        let mut near = BTreeMap::new();
+        for section in sections.iter().flat_map(Sections::all) {
+            if let Entry::Vacant(vacant) = near.entry(section) {
+                vacant.insert(self.near(section, place.channel, (min, max), None).await?);
+            }
+        }
+        Ok(Plan { sections, near })
+    }
+
+    /// All that a block depends on, in words.
+    pub(super) fn description(&self, place: Place, plan: &Plan) -> String {
+        let (volume, rules) = (&self.volume, self.rules);
+        let (sections, near) = (&plan.sections, &plan.near);
+        format!("block 1 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
+    }
+
+    /// Builds a block, as planned if it was.
+    pub(super) async fn block(
+        &self,
+        grid: &BlockGrid,
+        place: Place,
+        plan: Option<&Plan>,
+    ) -> Result<Block, StitchError> {
         match self.volume.dtype {
-            Dtype::Uint16 => self.block_of::<u16>(grid, place).await,
-            _ => self.block_of::<u8>(grid, place).await,
+            Dtype::Uint16 => self.block_of::<u16>(grid, place, plan).await,
+            _ => self.block_of::<u8>(grid, place, plan).await,
         }
     }
 
@@ -132,9 +167,10 @@ impl Builder {
         &self,
         grid: &BlockGrid,
         place: Place,
+        plan: Option<&Plan>,
     ) -> Result<Block, StitchError> {
         let voxels = place.voxels;
-        let slices = (voxels.min.z..voxels.max.z).map(|z| self.slice::<S>(place, z));
+        let slices = (voxels.min.z..voxels.max.z).map(|z| self.slice::<S>(place, z, plan));
         let slices = stream::iter(slices).buffered(SECTIONS_AT_ONCE);
         let slices: Vec<_> = slices.try_collect().await?;
         self.blocks.fetch_add(1, Ordering::Relaxed);
@@ -148,7 +184,11 @@ impl Builder {
         self.volume.levels[place.level as usize]
     }
 
-    fn sections(&self, place: Place, z: u32) -> Sections {
+    fn sections(&self, place: Place, z: u32, plan: Option<&Plan>) -> Sections {
+        let number = (z - place.voxels.min.z) as usize;
+        if let Some(sections) = plan.and_then(|plan| plan.sections.get(number)) {
+            return sections.clone();
+        }
         let rules = (self.rules.along_z, self.rules.gaps);
         Sections::of(self.tiles.index(), rules, self.level(place), z)
     }
@@ -177,7 +217,7 @@ impl Builder {
         place: Place,
         z: u32,
     ) -> Result<Option<(u16, u16)>, StitchError> {
-        match self.sections(place, z) {
+        match self.sections(place, z, None) {
             Sections::FirstOf(sections) => self.range_of(place, &sections).await,
             Sections::Between(below, above, _) => {
                 let below = self.range_of(place, &below).await?;
@@ -197,7 +237,7 @@ impl Builder {
         let mut planned: Option<Grid> = None;
         let mut range = None;
         for &section in sections {
-            let near = self.near(section, place.channel, min, max).await?;
+            let near = self.near(section, place.channel, (min, max), None).await?;
             if near.is_empty() {
                 continue;
             }
@@ -234,9 +274,12 @@ impl Builder {
         &self,
         section: u32,
         channel: u32,
-        min: DVec2,
-        max: DVec2,
+        (min, max): (DVec2, DVec2),
+        plan: Option<&Plan>,
     ) -> Result<Vec<Arc<IndexedTile>>, StitchError> {
+        if let Some(near) = plan.and_then(|plan| plan.near.get(&section)) {
+            return Ok(near.clone());
+        }
         let index = self.tiles.index().section(section).await;
         let index = index.map_err(|source| StitchError::Catalog { source })?;
         Ok(index.near(channel, min, max))
@@ -257,7 +300,7 @@ impl Builder {
         &self,
         place: Place,
     ) -> Result<Option<Vec<u8>>, Arc<StitchError>> {
-        let slice = self.slice::<S>(place, place.voxels.min.z).await;
+        let slice = self.slice::<S>(place, place.voxels.min.z, None).await;
         let slice = slice.map_err(Arc::new)?;
         match slice.failures.first() {
             Some(failure) => Err(failure.error()),
@@ -270,13 +313,18 @@ impl Builder {
     }
 
     /// Stitches one z of a block.
-    async fn slice<S: Sample>(&self, place: Place, z: u32) -> Result<Slice<S>, StitchError> {
-        let (below, above, part) = match self.sections(place, z) {
-            Sections::FirstOf(sections) => return self.first_of(place, sections).await,
+    async fn slice<S: Sample>(
+        &self,
+        place: Place,
+        z: u32,
+        plan: Option<&Plan>,
+    ) -> Result<Slice<S>, StitchError> {
+        let (below, above, part) = match self.sections(place, z, plan) {
+            Sections::FirstOf(sections) => return self.first_of(place, sections, plan).await,
             Sections::Between(below, above, part) => (below, above, part),
         };
-        let below = self.first_of::<S>(place, below);
-        let above = self.first_of::<S>(place, above);
+        let below = self.first_of::<S>(place, below, plan);
+        let above = self.first_of::<S>(place, above, plan);
         let (mut below, above) = try_join(below, above).await?;
         let mixed = on_rayon(move || {
             below.values = match (below.values, above.values) {
@@ -297,6 +345,7 @@ impl Builder {
         &self,
         place: Place,
         sections: Vec<u32>,
+        plan: Option<&Plan>,
     ) -> Result<Slice<S>, StitchError> {
         let (voxels, level, rules) = (place.voxels, self.level(place), self.rules);
         let size = voxels.size().truncate();
@@ -306,7 +355,7 @@ impl Builder {
         let whole = Grid::of_level(level, voxels);
         let (min, max) = whole.bounds();
         for section in sections {
-            let mut near = self.near(section, place.channel, min, max).await?;
+            let mut near = self.near(section, place.channel, (min, max), plan).await?;
             if near.is_empty() {
                 continue;
             }

@@ -15,6 +15,7 @@ use saccade_view::background_from_text;
 use crate::arguments::{picture, picture_size, seconds};
 use crate::open::Place;
 use crate::report::{say, tell};
+use crate::stitching::Stitching;
 
 /// Draw a volume into a PNG file. Waits until the picture is complete.
 #[derive(Args)]
@@ -69,12 +70,19 @@ pub(crate) struct Render {
     /// Write the picture even if it is not complete by then
     #[arg(long)]
     partial: bool,
+
+    #[command(flatten)]
+    stitching: Stitching,
 }
 
 impl Render {
     pub(crate) async fn run(self) -> Result<()> {
         let transfer = self.transfer_function()?;
-        let source = self.place.open(self.volume.as_deref()).await?.source;
+        let source = self
+            .place
+            .open(self.volume.as_deref(), &self.stitching)
+            .await?
+            .source;
         let gpu = Gpu::headless().await?;
         let gpu_bytes = u64::from(self.gpu_memory) << 20;
         let options = SessionOptions {

@@ -8,10 +8,10 @@ use anyhow::Result;
 use clap::Args;
 use saccade_archive::VisualizationArchive;
 use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, offer_archive};
-use saccade_source::stitched::StitchedOptions;
 
 use crate::interrupt::interrupted;
 use crate::report::{say, tell};
+use crate::stitching::Stitching;
 
 /// Offer the volumes of an archive over HTTP, with the browser application.
 #[derive(Args)]
@@ -21,6 +21,9 @@ pub(crate) struct Serve {
 
     #[command(flatten)]
     at: At,
+
+    #[command(flatten)]
+    stitching: Stitching,
 }
 
 /// Where to listen.
@@ -73,8 +76,12 @@ impl Serve {
         let archive = VisualizationArchive::open(&self.archive).await?;
         let server = Server::bind(self.at.address()).await?;
         let volumes = Volumes::new();
-        let options = StitchedOptions::default();
-        if offer_archive(&volumes, &archive, options).await?.is_empty() {
+        let options = self.stitching.options().await;
+        let disk_cache = options.disk_cache.clone();
+        if offer_archive(&volumes, &archive, options.clone())
+            .await?
+            .is_empty()
+        {
             say("the archive holds no volumes yet; they are offered as they appear");
         }
         tell(&server.url());
@@ -82,6 +89,9 @@ impl Serve {
         tokio::select! {
             served = server.run(volumes.clone(), self.at.options(), interrupted()) => served?,
             () = follow => {}
+        }
+        if let Some(cache) = disk_cache {
+            cache.close().await;
         }
         Ok(())
     }

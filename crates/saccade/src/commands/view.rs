@@ -6,6 +6,7 @@ use saccade_core::camera::Camera;
 use saccade_view::{SourceSpec, ViewOptions, background_from_text, run};
 
 use crate::open::{Opened, Place};
+use crate::stitching::Stitching;
 
 /// Look at a volume in a window of its own.
 #[derive(Args)]
@@ -30,6 +31,9 @@ pub(crate) struct View {
     /// Ceiling for GPU memory [MiB]
     #[arg(long, value_name = "MIB", default_value_t = 512)]
     gpu_memory: u32,
+
+    #[command(flatten)]
+    stitching: Stitching,
 }
 
 impl View {
@@ -37,7 +41,10 @@ impl View {
         let Opened {
             source,
             acquisition,
-        } = self.place.open(self.volume.as_deref()).await?;
+        } = self
+            .place
+            .open(self.volume.as_deref(), &self.stitching)
+            .await?;
         let options = ViewOptions {
             camera: self.camera,
             background: self.background,

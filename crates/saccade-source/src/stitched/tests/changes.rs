@@ -2,6 +2,7 @@
 
 use std::cell::RefCell;
 use std::ops::Range;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -18,7 +19,7 @@ use super::fixture::{Fixture, Levels, bounds, chunk_of, difference, read_all, ti
 use super::oracle::RawTile;
 use super::run;
 use crate::conformance::check_changes;
-use crate::stitched::StitchedSource;
+use crate::stitched::{DiskCache, StitchedOptions, StitchedSource};
 use crate::{Chunk, ChunkId, VolumeSource};
 
 const FIRST: ChunkId = ChunkId {
@@ -94,6 +95,11 @@ fn every_kind_of_change_is_told_and_seen() {
 enum Step {
     Put(usize, u32, (f64, f64), f64, u64),
     Move(usize, (f64, f64), f64),
+    /// A whole section, in one commit.
+    Shift(u32, (f64, f64)),
+    Delete(usize),
+    /// As after a restart, with the same cache on disk.
+    Reopen,
     Read(usize),
     /// Begins to read and gives up.
     Drop(usize),
@@ -105,10 +111,20 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
         (0..5_usize, 0..5_u32, corner(), -40.0..40.0, any::<u64>())
             .prop_map(|(n, z, at, turn, seed)| Step::Put(n, z, at, turn, seed)),
         (0..5_usize, corner(), -40.0..40.0).prop_map(|(n, at, turn)| Step::Move(n, at, turn)),
+        (0..3_u32, (-9.0..9.0, -9.0..9.0)).prop_map(|(z, by)| Step::Shift(z, by)),
+        (0..5_usize).prop_map(Step::Delete),
+        Just(Step::Reopen),
         (0..64_usize).prop_map(Step::Read),
         (0..64_usize).prop_map(Step::Drop),
     ];
     prop::collection::vec(step, 4..24)
+}
+
+async fn cached(folder: &Path) -> StitchedOptions {
+    StitchedOptions {
+        disk_cache: Some(DiskCache::open(folder, 0).await.unwrap()),
+        ..StitchedOptions::default()
+    }
 }
 
 /// Waits until the source knows all that the catalog does.
@@ -126,7 +142,9 @@ proptest! {
     fn nothing_stale_remains(steps in steps()) {
         run(async {
             let mut fixture = small(Arc::new(MemoryStorage::new())).await;
-            let source = fixture.open().await;
+            let folder = tempfile::tempdir().unwrap();
+            let mut options = cached(folder.path()).await;
+            let mut source = fixture.open_with(options.clone()).await;
             let mut changes = source.changes();
             let volume = fixture.volume.clone();
             let ids: Vec<_> = (0..).zip(&volume.levels).flat_map(|(level, _)| {
@@ -150,6 +168,19 @@ proptest! {
                             changed = true;
                         }
                     }
+                    Step::Shift(z, by) => {
+                        let catalog = fixture.archive.catalog();
+                        changed |= !catalog.section_tiles("v", z).await.unwrap().is_empty();
+                        fixture.shift(z, by).await;
+                    }
+                    Step::Delete(n) => changed |= fixture.delete(&format!("t{n}")).await,
+                    Step::Reopen => {
+                        drop((source, changes));
+                        options.disk_cache.take().unwrap().close().await;
+                        options = cached(folder.path()).await;
+                        source = fixture.open_with(options.clone()).await;
+                        (changes, changed) = (source.changes(), false);
+                    }
                     Step::Read(n) => drop(source.read(ids[n % ids.len()]).await.unwrap()),
                     Step::Drop(n) => drop(source.read(ids[n % ids.len()]).now_or_never()),
                 }
@@ -159,6 +190,15 @@ proptest! {
             }
             let (old, fresh) = (read_all(&source).await, read_all(&fixture.open().await).await);
             prop_assert!(old == fresh, "stale voxels");
+            // What the disk has now is what will be.
+            drop(source);
+            options.disk_cache.take().unwrap().close().await;
+            let again = fixture.open_with(cached(folder.path()).await).await;
+            prop_assert!(read_all(&again).await == fresh, "stale voxels on disk");
+            let found = again.statistics().blocks_from_disk;
+            let any = fresh.iter().flatten().any(|v| *v != 0);
+            prop_assert_eq!(found > 0, any, "{} blocks found", found);
+            prop_assert_eq!(again.statistics().blocks_built, 0);
             let (coverage, most) = difference(&fresh, &fixture.expected());
             prop_assert_eq!((coverage, most <= 1), (0, true));
             Ok(())

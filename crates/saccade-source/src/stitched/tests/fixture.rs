@@ -122,6 +122,33 @@ impl Fixture {
         (tile.transform, tile.age) = (transform, self.changes);
     }
 
+    /// Moves all tiles of a section by as much, at once.
+    pub(super) async fn shift(&mut self, section: u32, by: (f64, f64)) {
+        self.changes += 1;
+        let catalog = self.archive.catalog();
+        let tiles = catalog.section_tiles("v", section).await.unwrap();
+        let mut commit = catalog.begin("v").await.unwrap();
+        for tile in tiles {
+            let moved = tile.transform.shifted(by.into());
+            let name = &tile.name;
+            { commit.transform(name, moved, Some(self.changes)).await }.unwrap();
+            let known = self.tiles.get_mut(&tile.id.0).unwrap();
+            (known.transform, known.age) = (moved.elements(), self.changes);
+        }
+        commit.finish().await.unwrap();
+    }
+
+    /// Deletes a tile, if there is one of that name.
+    pub(super) async fn delete(&mut self, name: &str) -> bool {
+        self.changes += 1;
+        let catalog = self.archive.catalog();
+        let Some(tile) = catalog.tile("v", name).await.unwrap() else {
+            return false;
+        };
+        { catalog.delete_tile("v", name, self.changes).await }.unwrap();
+        self.tiles.remove(&tile.id.0).is_some()
+    }
+
     /// All voxels as they should be.
     pub(super) fn expected(&self) -> Levels {
         expected(&self.volume, &self.tiles)

@@ -97,9 +97,10 @@ fn every_choice_equals_brute_force_and_no_other() {
                 },
             ),
         ];
-        let wanted = choices.map(|(_, how)| expected_as(&fixture.volume, &fixture.tiles, how));
+        let wanted = { choices.each_ref() }
+            .map(|(_, how)| expected_as(&fixture.volume, &fixture.tiles, *how));
         for (n, (options, how)) in choices.into_iter().enumerate() {
-            let got = read_all(&fixture.open_with(options).await).await;
+            let got = read_all(&fixture.open_with(options.clone()).await).await;
             for (other, want) in wanted.iter().enumerate() {
                 let (coverage, most) = difference(&got, want);
                 if n == other {
@@ -145,7 +146,7 @@ fn bounds_hold_for_every_choice() {
                     along_z: AlongZ::Linear,
                     ..StitchedOptions::default()
                 };
-                let source = fixture.open_with(options).await;
+                let source = fixture.open_with(options.clone()).await;
                 let got = read_all(&source).await;
                 let how = How {
                     between,
@@ -156,7 +157,7 @@ fn bounds_hold_for_every_choice() {
                 let want = expected_as(&volume, &fixture.tiles, how);
                 let (coverage, most) = difference(&got, &want);
                 assert!(coverage == 0 && most <= 1, "{options:?}: {most}");
-                let unread = fixture.open_with(options).await;
+                let unread = fixture.open_with(options.clone()).await;
                 let (mut tight, mut all) = (0, 0);
                 for level in 0..volume.levels.len() as u32 {
                     let chunks = volume.chunks(level as usize);
@@ -212,7 +213,7 @@ fn finer_tiles_are_seen_where_there_are_such() {
                 overlaps,
                 ..StitchedOptions::default()
             };
-            let source = fixture.open_with(options).await;
+            let source = fixture.open_with(options.clone()).await;
             let got = read_all(&source).await;
             let how = How {
                 blend: overlaps == Overlaps::Blend,
@@ -351,7 +352,7 @@ fn sixteen_bits_are_exact() {
                 },
                 options,
             ] {
-                let source = fixture.open_with(options).await;
+                let source = fixture.open_with(options.clone()).await;
                 let got = read_all(&source).await;
                 let want = expected_as(&fixture.volume, &fixture.tiles, how);
                 let (coverage, most) = difference(&got, &want);

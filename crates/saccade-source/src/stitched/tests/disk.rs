@@ -1,0 +1,171 @@
+//! Finished blocks outlive a restart, nothing stale does, and a bad folder costs time only.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use glam::{DVec3, UVec3};
+use saccade_archive::storage::MemoryStorage;
+
+use super::fixture::{Fixture, difference, read_all, tile};
+use super::run;
+use crate::stitched::{DiskCache, DiskCacheError, StitchedOptions};
+
+/// Two levels of several blocks each.
+async fn wide() -> Fixture {
+    let extent = UVec3::new(1100, 90, 3);
+    let storage = Arc::new(MemoryStorage::new());
+    let mut fixture = Fixture::on(storage, extent, DVec3::new(4.0, 4.0, 30.0)).await;
+    for n in 0..6_u32 {
+        let corner = (f64::from(n) * 180.0 + 3.0, -4.0);
+        let tile = tile((170, 110), n % 3, corner, 1.0, 1.0, n.into());
+        fixture.put(&format!("t{n}"), tile).await;
+    }
+    fixture
+}
+
+async fn options(folder: &Path) -> StitchedOptions {
+    StitchedOptions {
+        disk_cache: Some(DiskCache::open(folder, 0).await.unwrap()),
+        ..StitchedOptions::default()
+    }
+}
+
+async fn fill(fixture: &Fixture, folder: &Path) -> u64 {
+    let mut options = options(folder).await;
+    let source = fixture.open_with(options.clone()).await;
+    let (coverage, most) = difference(&read_all(&source).await, &fixture.expected());
+    assert_eq!((coverage, most <= 1), (0, true));
+    let statistics = source.statistics();
+    assert_eq!(statistics.blocks_from_disk, 0);
+    drop(source);
+    options.disk_cache.take().unwrap().close().await;
+    statistics.blocks_built
+}
+
+#[test]
+fn a_restart_builds_only_what_changed() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let mut fixture = wide().await;
+        let blocks = fill(&fixture, folder.path()).await;
+        assert!(blocks > 4, "{blocks}");
+
+        let source = fixture.open_with(options(folder.path()).await).await;
+        let (coverage, most) = difference(&read_all(&source).await, &fixture.expected());
+        assert_eq!((coverage, most <= 1), (0, true));
+        let found = source.statistics();
+        assert_eq!((found.blocks_built, found.blocks_from_disk), (0, blocks));
+        assert_eq!(found.pyramids_opened, 0);
+        drop(source);
+
+        // A tile moves while nobody looks; it is seen in the first block only.
+        let moved = tile((170, 110), 0, (11.0, -9.0), -2.0, 1.0, 0).transform;
+        fixture.transform("t0", moved).await;
+        let source = fixture.open_with(options(folder.path()).await).await;
+        let (coverage, most) = difference(&read_all(&source).await, &fixture.expected());
+        assert_eq!((coverage, most <= 1), (0, true), "stale voxels");
+        let found = source.statistics();
+        assert!(
+            found.blocks_built > 0 && found.blocks_from_disk > 0,
+            "{found:?}"
+        );
+
+        // Other rules are another picture.
+        let mut blended = options_of_open(&source);
+        blended.overlaps = crate::stitched::Overlaps::Blend;
+        let other = fixture.open_with(blended).await;
+        read_all(&other).await;
+        assert_eq!(other.statistics().blocks_from_disk, 0);
+    });
+}
+
+/// With the cache that is open already.
+fn options_of_open(source: &crate::stitched::StitchedSource) -> StitchedOptions {
+    let disk_cache = source.inner.disk.as_ref().map(|(disk, _)| disk.clone());
+    StitchedOptions {
+        disk_cache,
+        ..StitchedOptions::default()
+    }
+}
+
+#[test]
+fn an_archive_in_the_place_of_another_shares_nothing_with_it() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let first = wide().await;
+        let options = options(folder.path()).await;
+        let source = first.open_with(options.clone()).await;
+        read_all(&source).await;
+        // The same catalog, other pixels of the same names.
+        let mut second = wide().await;
+        let mut dark = tile((170, 110), 0, (3.0, -4.0), 1.0, 1.0, 0);
+        dark.pixels.iter_mut().for_each(|p| *p = 1 + *p / 9);
+        second.put("t0", dark).await;
+        let archive = saccade_archive::VisualizationArchive::from_parts(
+            first.archive.catalog().clone(),
+            second.storage.clone(),
+        );
+        let source = crate::stitched::StitchedSource::open(&archive, "v", options);
+        let source = source.await.unwrap();
+        read_all(&source).await;
+        assert_eq!(source.statistics().blocks_from_disk, 0);
+    });
+}
+
+#[test]
+fn a_damaged_cache_costs_time_only() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let fixture = wide().await;
+        let blocks = fill(&fixture, folder.path()).await;
+        // One bit in a thousand bytes, all over; the index of blocks included.
+        for entry in std::fs::read_dir(folder.path()).unwrap() {
+            let path = entry.unwrap().path();
+            let mut bytes = std::fs::read(&path).unwrap();
+            bytes.iter_mut().step_by(997).for_each(|byte| *byte ^= 4);
+            std::fs::write(&path, bytes).unwrap();
+        }
+        let rebuilt = fill(&fixture, folder.path()).await;
+        assert_eq!(rebuilt, blocks);
+        // Cut short, and then gone.
+        for entry in std::fs::read_dir(folder.path()).unwrap() {
+            let file = std::fs::File::options()
+                .write(true)
+                .open(entry.unwrap().path());
+            file.unwrap().set_len(5000).unwrap();
+        }
+        assert_eq!(fill(&fixture, folder.path()).await, blocks);
+        let source = fixture.open_with(options(folder.path()).await).await;
+        read_all(&source).await;
+        assert_eq!(
+            source.statistics().blocks_from_disk,
+            blocks,
+            "it works again"
+        );
+        drop(source);
+    });
+}
+
+#[test]
+fn folders_that_cannot_be_used_are_told() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = DiskCache::open(folder.path(), 1 << 30).await.unwrap();
+        let taken = DiskCache::open(folder.path(), 1 << 30).await;
+        assert!(
+            matches!(taken, Err(DiskCacheError::Taken { .. })),
+            "{taken:?}"
+        );
+        cache.close().await;
+        drop(cache);
+        // A smaller one leaves no files of the larger one behind.
+        let files = || std::fs::read_dir(folder.path()).unwrap().count();
+        let many = files();
+        let cache = DiskCache::open(folder.path(), 0).await.unwrap();
+        assert_eq!((many, files()), (16 + 1, 4 + 1));
+        drop(cache);
+        let file = folder.path().join("lock");
+        let open = DiskCache::open(&file, 0).await;
+        assert!(matches!(open, Err(DiskCacheError::Open { .. })), "{open:?}");
+    });
+}
