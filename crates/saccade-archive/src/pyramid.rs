@@ -21,6 +21,11 @@
 //! takes no space and needs no read. Elsewhere a 0 is a measured black like any other: every pixel
 //! of a tile was acquired.
 //!
+//! # Checksums
+//!
+//! Each sub-tile's bytes and the description have a CRC-32. Reading a sub-tile does not compute it;
+//! [`verify`] does, of a whole file. Files from before there were checksums are read as well.
+//!
 //! # Failure
 //!
 //! A file may be damaged or hostile: reading it ends in a [`PyramidError`], never a panic, and
@@ -40,11 +45,13 @@ mod morton;
 mod parse;
 #[cfg(test)]
 mod tests;
+mod verify;
 mod voxel;
 
 pub use encode::{encode, encode_labels};
 pub use error::{EncodeError, PyramidError};
 pub use index::{PyramidIndex, SubTileRead};
+pub use verify::{Verified, verify, verify_quickly};
 pub use voxel::Voxel;
 
 /// Edge of a sub-tile \[pixels\].

@@ -10,7 +10,7 @@ use super::{PyramidError, PyramidLevel, SUB_TILE_VOXELS, SubTileEntry, codec};
 use crate::storage::Storage;
 
 /// The first read: whole for tiles of up to 12,000 x 12,000 pixels.
-const FIRST_READ: u64 = 160 << 10;
+const FIRST_READ: u64 = 192 << 10;
 
 /// No coalesced read is longer, single sub-tiles aside.
 const MAX_READ: u64 = 8 << 20;
@@ -44,6 +44,14 @@ impl PyramidIndex {
     ///
     /// [`PyramidError::Storage`] and [`PyramidError::Broken`].
     pub async fn open(storage: &dyn Storage, name: &str) -> Result<Self, PyramidError> {
+        Ok(Self::open_with_bytes(storage, name).await?.0)
+    }
+
+    /// The same, with the bytes that hold the index.
+    pub(super) async fn open_with_bytes(
+        storage: &dyn Storage,
+        name: &str,
+    ) -> Result<(Self, Bytes), PyramidError> {
         let read = async |range| {
             let failed = |source| PyramidError::Storage {
                 source,
@@ -66,7 +74,8 @@ impl PyramidIndex {
         if (bytes.len() as u64) < len {
             return Err(broken(format!("it ends within its index of {len} bytes")));
         }
-        Self::parse(&bytes, name)
+        bytes.truncate(usize::try_from(len).unwrap_or(usize::MAX));
+        Ok((Self::parse(&bytes, name)?, bytes))
     }
 
     /// Reads the index from bytes that begin a file and hold all of its index.
@@ -125,6 +134,12 @@ impl PyramidIndex {
             .flatten()
             .map(|e| e.offset + u64::from(e.len));
         ends.max().unwrap_or(0)
+    }
+
+    /// Where the first sub-tile begins; `None` if all are blank.
+    pub(super) fn begin(&self) -> Option<u64> {
+        let entries = self.entries.iter().flatten().filter(|e| !e.is_blank());
+        entries.map(|e| e.offset).min()
     }
 
     /// Memory that the index takes \[bytes\].

@@ -30,6 +30,10 @@ pub(super) const JPEG_TABLES: u16 = 347;
 pub(super) const INDEX_LEN: u16 = 65_000;
 /// Private: min, max, mean of each sub-tile, in the order of the offsets, of the voxels' type.
 pub(super) const SUB_TILE_STATS: u16 = 65_001;
+/// Private: CRC-32 of each sub-tile's bytes, in the order of the offsets.
+pub(super) const SUB_TILE_CHECKSUMS: u16 = 65_002;
+/// Private: CRC-32 of the [`INDEX_LEN`] bytes, this value taken as 0. The last tag of its directory.
+pub(super) const INDEX_CHECKSUM: u16 = 65_003;
 
 pub(super) const COMPRESSION_JPEG: u16 = 7;
 pub(super) const COMPRESSION_DEFLATE: u16 = 8;
@@ -57,6 +61,8 @@ pub(super) fn stats_kind(dtype: Dtype) -> u16 {
 pub(super) struct Coded {
     /// Place in the level, and entry with its offset counted from the first of `bytes`.
     sub_tiles: Vec<(UVec2, SubTileEntry)>,
+    /// Checksums of the sub-tiles.
+    checksums: Vec<u32>,
     pub(super) bytes: Vec<u8>,
 }
 
@@ -64,6 +70,7 @@ impl Coded {
     /// Adds the sub-tile whose bytes, from `begin`, were just appended.
     pub(super) fn push(&mut self, at: UVec2, begin: usize, entry: SubTileEntry) {
         let len = u32::try_from(self.bytes.len() - begin).expect("a sub-tile is small");
+        self.checksums.push(crc32fast::hash(&self.bytes[begin..]));
         self.sub_tiles.push((
             at,
             SubTileEntry {
@@ -75,6 +82,7 @@ impl Coded {
     }
 
     pub(super) fn push_blank(&mut self, at: UVec2) {
+        self.checksums.push(0);
         self.sub_tiles.push((at, SubTileEntry::BLANK));
     }
 }
@@ -142,6 +150,9 @@ impl Parts {
         // Values are of known size: the first pass finds where the data begins, the second says so.
         let begin = writer.describe(0).len();
         let mut file = writer.describe(begin as u64);
+        let checksum = crc32fast::hash(&file).to_le_bytes();
+        let at = writer.index_checksum_at();
+        file[at..at + 4].copy_from_slice(&checksum);
         file.reserve_exact(self.data_len());
         file.extend_from_slice(&self.blank);
         for level in self.coded.iter().rev() {
@@ -176,7 +187,7 @@ impl Writer<'_> {
         } else {
             file.extend_from_slice(&[42, 0]);
         }
-        let first = if self.big { 16 } else { 8 };
+        let first = self.first() as u64;
         file.extend(self.offset(first));
         // Directories are written one after another; the first names where the others begin.
         let mut at = data + self.parts.blank.len() as u64;
@@ -200,6 +211,19 @@ impl Writer<'_> {
         file
     }
 
+    /// Where the first directory begins.
+    fn first(&self) -> usize {
+        if self.big { 16 } else { 8 }
+    }
+
+    /// Where the value of [`INDEX_CHECKSUM`] is, in the last entry of the first directory.
+    fn index_checksum_at(&self) -> usize {
+        let (count_len, entry_len, value_at) = if self.big { (8, 20, 12) } else { (2, 12, 8) };
+        let sub_ifds = vec![0; self.parts.levels.len() - 1];
+        let entries = self.fields(0, 0, 0, &sub_ifds).len();
+        self.first() + count_len + entry_len * (entries - 1) + value_at
+    }
+
     /// A level's tags, in order. Its data begins at `begin`; the index, and the blank sub-tile's
     /// data, ends and begins at `data`.
     fn fields(&self, level: usize, begin: u64, data: u64, sub_ifds: &[u64]) -> Vec<Field> {
@@ -213,10 +237,16 @@ impl Writer<'_> {
         let mut places = vec![(data, blank_len); tiles];
         let bytes = self.parts.dtype.bytes();
         let mut stats = vec![0; 3 * bytes * tiles];
+        let blank = crc32fast::hash(&self.parts.blank).to_le_bytes();
+        let mut checksums = blank.repeat(tiles);
         let mut begin = begin;
         for part in &self.parts.coded[level] {
-            for (at, entry) in part.sub_tiles.iter().filter(|(_, entry)| !entry.is_blank()) {
+            for ((at, entry), checksum) in part.sub_tiles.iter().zip(&part.checksums) {
+                if entry.is_blank() {
+                    continue;
+                }
                 let index = (at.y * sub_tiles.x + at.x) as usize;
+                checksums[4 * index..][..4].copy_from_slice(&checksum.to_le_bytes());
                 places[index] = (begin + entry.offset, entry.len);
                 let values = [entry.min, entry.max, entry.mean];
                 let to = stats[3 * bytes * index..].chunks_exact_mut(bytes);
@@ -285,6 +315,14 @@ impl Writer<'_> {
             kind: stats_kind(self.parts.dtype),
             value: stats,
         });
+        fields.push(Field {
+            tag: SUB_TILE_CHECKSUMS,
+            kind: LONG,
+            value: checksums,
+        });
+        if level == 0 {
+            fields.push(Field::long(INDEX_CHECKSUM, 0));
+        }
         fields
     }
 

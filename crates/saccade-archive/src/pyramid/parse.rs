@@ -4,9 +4,9 @@ use saccade_core::volume::Dtype;
 
 use super::layout::{
     BITS_PER_SAMPLE, BYTE, COMPRESSION, COMPRESSION_DEFLATE, COMPRESSION_JPEG, IMAGE_LENGTH,
-    IMAGE_WIDTH, INDEX_LEN, JPEG_TABLES, LONG, LONG8, PREDICTOR, PREDICTOR_HORIZONTAL, SHORT,
-    SUB_IFDS, SUB_TILE_STATS, TILE_BYTE_COUNTS, TILE_LENGTH, TILE_OFFSETS, TILE_WIDTH, UNDEFINED,
-    bits_of, stats_kind,
+    IMAGE_WIDTH, INDEX_CHECKSUM, INDEX_LEN, JPEG_TABLES, LONG, LONG8, PREDICTOR,
+    PREDICTOR_HORIZONTAL, SHORT, SUB_IFDS, SUB_TILE_CHECKSUMS, SUB_TILE_STATS, TILE_BYTE_COUNTS,
+    TILE_LENGTH, TILE_OFFSETS, TILE_WIDTH, UNDEFINED, bits_of, stats_kind,
 };
 use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry, levels_of};
 use crate::image::MAX_EDGE;
@@ -116,6 +116,45 @@ pub(super) fn describe(bytes: &[u8]) -> Result<Description, Reason> {
         jpeg_tables,
         dtype,
     })
+}
+
+/// Checksums of the sub-tiles of each level, row by row, after the index that names them was held
+/// against its own; `None` for a file from before there were any.
+pub(super) fn checksums(bytes: &[u8], levels: usize) -> Result<Option<Vec<Vec<u32>>>, Reason> {
+    let file = File::new(bytes)?;
+    let first = file.directory(file.first)?;
+    let tags = [INDEX_CHECKSUM, SUB_TILE_CHECKSUMS];
+    let known = tags.map(|tag| first.fields.iter().any(|field| field.tag == tag));
+    if known == [false; 2] {
+        return Ok(None);
+    }
+    let want = first.one(INDEX_CHECKSUM)?;
+    // It is the last entry's value.
+    let (count_len, entry_len, value_at) = if file.big { (8, 20, 12) } else { (2, 12, 8) };
+    let entries = file.number(file.first, count_len)?;
+    let at = file.first + count_len as u64 + entry_len * entries.saturating_sub(1) + value_at;
+    file.slice(at, 4)?;
+    let at = usize::try_from(at).map_err(|_| "its index has no end")?;
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(&bytes[..at]);
+    hasher.update(&[0; 4]);
+    hasher.update(&bytes[at + 4..]);
+    if u64::from(hasher.finalize()) != want {
+        return Err("its index does not have its checksum".to_owned());
+    }
+    let sub_ifds = if levels > 1 {
+        first.offsets(SUB_IFDS)?
+    } else {
+        Vec::new()
+    };
+    let others = sub_ifds.into_iter().map(|at| file.directory(at));
+    let directories = std::iter::once(Ok(first)).chain(others);
+    let checksums = directories.map(|directory| {
+        let checksums = directory?.bytes(SUB_TILE_CHECKSUMS, LONG)?;
+        let checksums = checksums.as_chunks::<4>().0.iter();
+        Ok(checksums.map(|c| u32::from_le_bytes(*c)).collect())
+    });
+    Ok(Some(checksums.collect::<Result<_, Reason>>()?))
 }
 
 fn entries(

@@ -1,0 +1,183 @@
+use bytes::Bytes;
+
+use super::{PyramidError, PyramidIndex, SUB_TILE_VOXELS, parse};
+use crate::storage::Storage;
+
+/// What was found whole.
+#[derive(Clone, Debug)]
+pub struct Verified {
+    /// The pyramid's index.
+    pub index: PyramidIndex,
+    /// Whether the file has checksums; older ones have none, and their voxels were only decoded.
+    pub checksums: bool,
+}
+
+/// Reads a pyramid to its last byte: description and every sub-tile, each held against its checksum
+/// and decoded. Runs for a second per gigapixel; call it where that may be.
+///
+/// # Errors
+///
+/// [`PyramidError::Broken`] names the first thing that is wrong.
+pub fn verify(bytes: &[u8], name: &str) -> Result<Verified, PyramidError> {
+    let broken = |reason| PyramidError::Broken {
+        reason,
+        name: name.to_owned(),
+    };
+    let index = PyramidIndex::parse(bytes, name)?;
+    let len = parse::index_len(bytes).map_err(broken)?;
+    let head = usize::try_from(len).ok().and_then(|len| bytes.get(..len));
+    let head = head.ok_or_else(|| broken("it ends within its index".to_owned()))?;
+    let checksums = parse::checksums(head, index.levels().len()).map_err(broken)?;
+    check_len(&index, len, bytes.len() as u64).map_err(broken)?;
+    // Other tools read it for every blank sub-tile.
+    let end = index.begin().and_then(|at| usize::try_from(at).ok());
+    let blank = bytes.get(head.len()..end.unwrap_or(bytes.len()));
+    let blank = crc32fast::hash(blank.unwrap_or_default());
+    let mut voxels = vec![0; SUB_TILE_VOXELS * index.dtype().bytes()];
+    for (level, size) in index.levels().iter().enumerate() {
+        for y in 0..size.sub_tiles.y {
+            for x in 0..size.sub_tiles.x {
+                let at = y as usize * size.sub_tiles.x as usize + x as usize;
+                let is_right = |checksum| {
+                    let known = checksums.as_ref().map(|all| all[level].get(at));
+                    known.is_none_or(|known| known == Some(&checksum))
+                };
+                let what = |wrong| broken(format!("sub-tile {x}, {y} of level {level} {wrong}"));
+                let Some(entry) = index.sub_tile(level, x, y).filter(|e| !e.is_blank()) else {
+                    if !is_right(blank) {
+                        return Err(what("is blank, but what is stored for it is not"));
+                    }
+                    continue;
+                };
+                let begin = usize::try_from(entry.offset).unwrap_or(usize::MAX);
+                let range = begin..begin.saturating_add(entry.len as usize);
+                let coded = bytes.get(range).ok_or_else(|| what("lies past its end"))?;
+                if !is_right(crc32fast::hash(coded)) {
+                    return Err(what("does not have its checksum"));
+                }
+                index.decode_sub_tile_into(level, x, y, coded, &mut voxels)?;
+            }
+        }
+    }
+    Ok(Verified {
+        index,
+        checksums: checksums.is_some(),
+    })
+}
+
+/// Looks at a pyramid from outside: its description, with its checksum, and its length. No
+/// sub-tile is read.
+///
+/// # Errors
+///
+/// [`PyramidError`].
+pub async fn verify_quickly(storage: &dyn Storage, name: &str) -> Result<Verified, PyramidError> {
+    let broken = |reason| PyramidError::Broken {
+        reason,
+        name: name.to_owned(),
+    };
+    let failed = |source| PyramidError::Storage {
+        source,
+        name: name.to_owned(),
+    };
+    let (index, head): (PyramidIndex, Bytes) = PyramidIndex::open_with_bytes(storage, name).await?;
+    let checksums = parse::checksums(&head, index.levels().len()).map_err(broken)?;
+    let size = storage.size(name).await.map_err(failed)?;
+    check_len(&index, head.len() as u64, size).map_err(broken)?;
+    Ok(Verified {
+        index,
+        checksums: checksums.is_some(),
+    })
+}
+
+/// A file ends with its last sub-tile, or, if all are blank, with what stands for those.
+fn check_len(index: &PyramidIndex, index_len: u64, len: u64) -> Result<(), String> {
+    let (want, exact) = match index.end() {
+        0 => (index_len, false),
+        end => (end, true),
+    };
+    if len < want || (exact && len > want) {
+        Err(format!("it has {len} bytes instead of {want}"))
+    } else {
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::UVec2;
+
+    use super::*;
+    use crate::image::GrayImage;
+    use crate::pyramid::{Encoding, encode, layout};
+    use crate::storage::MemoryStorage;
+
+    /// Odd sizes, some sub-tiles blank.
+    fn file(encoding: Encoding) -> Vec<u8> {
+        let (width, height) = (300, 270);
+        let value = |at: u32| match (at % width, at / width) {
+            (x, y) if x < 150 && y < 140 => 0,
+            (x, y) => u8::try_from((x * 7 + y * 13) % 251).unwrap(),
+        };
+        let voxels = (0..width * height).map(value).collect();
+        let image = GrayImage {
+            width,
+            height,
+            voxels,
+        };
+        encode(&image, &encoding).unwrap().to_vec()
+    }
+
+    #[test]
+    fn every_flipped_byte_is_found() {
+        for encoding in [Encoding::Lossless, Encoding::Jpeg { quality: 80 }] {
+            let whole = file(encoding);
+            let verified = verify(&whole, "whole").unwrap();
+            assert!(verified.checksums);
+            assert!(verified.index.sub_tile(0, 0, 0).unwrap().is_blank());
+            for at in (0..whole.len()).step_by(7) {
+                let mut damaged = whole.clone();
+                damaged[at] ^= 1 << (at % 8);
+                assert!(verify(&damaged, "damaged").is_err(), "byte {at}");
+            }
+            for len in (0..whole.len()).step_by(97) {
+                assert!(verify(&whole[..len], "cut").is_err(), "cut to {len}");
+            }
+            let longer = [&whole[..], &[0]].concat();
+            assert!(verify(&longer, "longer").is_err());
+        }
+    }
+
+    #[tokio::test]
+    async fn a_quick_look_finds_what_is_wrong_with_index_and_length() {
+        let whole = file(Encoding::Lossless);
+        let storage = MemoryStorage::new();
+        let put = async |bytes: Vec<u8>| {
+            storage.write_durable("a", bytes.into()).await.unwrap();
+            verify_quickly(&storage, "a").await
+        };
+        let index = put(whole.clone()).await.unwrap().index;
+        assert_eq!(index.levels()[0].sub_tiles, UVec2::new(3, 3));
+        let end = usize::try_from(index.begin().unwrap()).unwrap();
+        for at in (0..end).step_by(11) {
+            let mut damaged = whole.clone();
+            damaged[at] ^= 0x10;
+            // The blank stream lies between.
+            let found = put(damaged.clone()).await.is_err();
+            assert!(found || verify(&damaged, "a").is_err(), "byte {at}");
+        }
+        assert!(put(whole[..whole.len() - 1].to_vec()).await.is_err());
+    }
+
+    /// As files were before they had checksums: tags that nobody knows stand in their place.
+    #[test]
+    fn files_without_checksums_are_read() {
+        let mut old = file(Encoding::Lossless);
+        for tag in [layout::INDEX_CHECKSUM, layout::SUB_TILE_CHECKSUMS] {
+            let [low, high] = tag.to_le_bytes();
+            let at = old.windows(4).position(|w| w == [low, high, 4, 0]).unwrap();
+            old[at] += 100;
+        }
+        assert!(!verify(&old, "old").unwrap().checksums);
+    }
+}
