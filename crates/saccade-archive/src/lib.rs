@@ -36,6 +36,10 @@ pub mod catalog;
 pub mod image;
 pub mod pyramid;
 pub mod storage;
+pub mod tls;
 mod visualization;
 
-pub use visualization::{ArchiveError, VisualizationArchive};
+pub use visualization::{
+    ArchiveError, ArchiveLocation, CatalogLocation, LocationError, StorageLocation,
+    VisualizationArchive,
+};

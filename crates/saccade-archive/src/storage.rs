@@ -2,22 +2,39 @@
 
 use std::fmt;
 use std::ops::Range;
+use std::time::SystemTime;
 
 use bytes::Bytes;
+use futures::FutureExt as _;
 use futures::future::BoxFuture;
 
 pub mod conformance;
+mod disk;
 mod error;
 mod faulty;
 mod local;
 mod memory;
 mod name;
+mod object;
 
+pub use disk::{Crash, DirEntry, Disk, Metadata, OpenFile, SimulatedDisk, SystemDisk};
 pub use error::StorageError;
 pub use faulty::{FaultyStorage, ReadFault, WriteFault};
 pub use local::LocalStorage;
 pub use memory::MemoryStorage;
 pub use name::check_name;
+pub use object::{BucketLocation, BucketLocationError, ObjectStorage};
+
+/// An object that a storage lists.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Entry {
+    /// Its name.
+    pub name: String,
+    /// Its size \[bytes\].
+    pub size: u64,
+    /// When it was written, if the storage knows.
+    pub modified: Option<SystemTime>,
+}
 
 /// Where a visualization archive keeps its objects: a folder, memory, an object store.
 ///
@@ -53,12 +70,26 @@ pub trait Storage: Send + Sync + fmt::Debug {
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>>;
 
-    /// Names of the objects that begin with `prefix`, sorted. Unfinished writes are not listed.
+    /// The objects whose names begin with `prefix`, sorted by name. Unfinished writes are not
+    /// listed.
     ///
     /// # Errors
     ///
     /// As they occur.
-    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>>;
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>>;
+
+    /// Their names.
+    ///
+    /// # Errors
+    ///
+    /// As they occur.
+    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
+        async move {
+            let entries = self.entries(prefix).await?;
+            Ok(entries.into_iter().map(|entry| entry.name).collect())
+        }
+        .boxed()
+    }
 
     /// Removes an object. It is no error if there is none.
     ///
@@ -73,4 +104,10 @@ pub trait Storage: Send + Sync + fmt::Debug {
     ///
     /// [`StorageError::NotFound`] where there is no such object, others as they occur.
     fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>>;
+
+    /// What beginning another read takes, as bytes that could have been read meanwhile: parts of an
+    /// object that lie closer together are better read as one.
+    fn read_cost(&self) -> u64 {
+        16 << 10
+    }
 }

@@ -1,13 +1,17 @@
-//! The visualization archive: pyramids and the catalog that names them, in one folder.
+//! The visualization archive: pyramids, below `tiles/` of a storage, and the catalog that names them.
+
+mod location;
 
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::catalog::{Catalog, CatalogError};
-use crate::storage::{LocalStorage, Storage, StorageError};
+use crate::storage::{LocalStorage, ObjectStorage, Storage, StorageError};
 
-/// A folder with `catalog.sqlite` and the pyramids below `tiles/`. Clones share it.
+pub use location::{ArchiveLocation, CatalogLocation, LocationError, StorageLocation};
+
+/// An open archive. Clones share it.
 #[derive(Clone, Debug)]
 pub struct VisualizationArchive {
     catalog: Catalog,
@@ -18,13 +22,13 @@ pub struct VisualizationArchive {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ArchiveError {
-    /// The folder holds no catalog.
+    /// There is no catalog.
     #[error(
-        "this folder is no visualization archive; `saccade ingest` or `saccade demo` makes one: {}",
+        "there is no visualization archive; `saccade ingest` or `saccade demo` makes one: {}",
         path.display()
     )]
     NotAnArchive {
-        /// The folder.
+        /// The catalog's file, which is not there.
         path: PathBuf,
     },
     /// The folder could not be made.
@@ -52,13 +56,15 @@ impl VisualizationArchive {
     /// # Errors
     ///
     /// [`ArchiveError`].
-    pub async fn open(folder: &Path) -> Result<Self, ArchiveError> {
-        if !folder.join(Self::CATALOG).is_file() {
+    pub async fn open(location: impl Into<ArchiveLocation>) -> Result<Self, ArchiveError> {
+        let location = location.into();
+        let CatalogLocation::File(file) = location.catalog();
+        if !file.is_file() {
             return Err(ArchiveError::NotAnArchive {
-                path: folder.to_owned(),
+                path: file.to_owned(),
             });
         }
-        Self::create(folder).await
+        Self::open_parts(&location).await
     }
 
     /// Opens an archive, and makes it first if there is none.
@@ -66,14 +72,35 @@ impl VisualizationArchive {
     /// # Errors
     ///
     /// [`ArchiveError`].
-    pub async fn create(folder: &Path) -> Result<Self, ArchiveError> {
-        std::fs::create_dir_all(folder).map_err(|source| ArchiveError::Folder {
-            source,
-            path: folder.to_owned(),
-        })?;
-        let catalog = Catalog::create(&folder.join(Self::CATALOG)).await?;
-        let storage = Arc::new(LocalStorage::new(folder)?);
-        Ok(Self { catalog, storage })
+    pub async fn create(location: impl Into<ArchiveLocation>) -> Result<Self, ArchiveError> {
+        let location = location.into();
+        let CatalogLocation::File(file) = location.catalog();
+        if let Some(folder) = file.parent() {
+            std::fs::create_dir_all(folder).map_err(|source| ArchiveError::Folder {
+                source,
+                path: folder.to_owned(),
+            })?;
+        }
+        Self::open_parts(&location).await
+    }
+
+    async fn open_parts(location: &ArchiveLocation) -> Result<Self, ArchiveError> {
+        let CatalogLocation::File(file) = location.catalog();
+        match location.storage() {
+            StorageLocation::Folder(folder) => {
+                let catalog = Catalog::create(file).await?;
+                let storage = Arc::new(LocalStorage::new(folder)?);
+                Ok(Self { catalog, storage })
+            }
+            StorageLocation::Bucket(bucket) => {
+                // Before a catalog is made: a wrong address should not leave one behind.
+                let storage = ObjectStorage::s3(bucket)?;
+                storage.check().await?;
+                let catalog = Catalog::create(file).await?;
+                let storage = Arc::new(storage);
+                Ok(Self { catalog, storage })
+            }
+        }
     }
 
     /// An archive of these parts.

@@ -1,6 +1,7 @@
 //! A volume behind a Saccade server, by HTTP. The same code natively and in browsers.
 
 mod chunks;
+mod client;
 mod event_parser;
 mod events;
 mod status;
@@ -20,6 +21,7 @@ use crate::conformance::check_volume;
 use crate::maybe_send::{BoxFuture, BoxStream, sleep, spawn};
 use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
 use chunks::Revisions;
+use client::client;
 
 pub use status::{Quarantined, Status, StatusReader};
 
@@ -164,7 +166,7 @@ struct NamedVolume {
 pub async fn volumes(base: &str) -> Result<Vec<String>, SourceError> {
     let list = async {
         let url = address(base, &["volumes.json"])?;
-        let list: VolumesJson = get_json(&Client::new(), url, RemoteOptions::default()).await?;
+        let list: VolumesJson = get_json(&client(), url, RemoteOptions::default()).await?;
         Ok(list.volumes.into_iter().map(|v| v.name).collect())
     };
     list.await.map_err(|error| open_error(error, base))
@@ -191,7 +193,7 @@ impl RemoteSource {
         name: &str,
         options: RemoteOptions,
     ) -> Result<Self, SourceError> {
-        let client = Client::new();
+        let client = client();
         let described = Self::describe(&client, base, name, options).await;
         let (url, VolumeJson { volume, revision }) = match described {
             Ok(described) => described,

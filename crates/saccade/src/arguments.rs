@@ -2,8 +2,50 @@
 
 use std::path::PathBuf;
 
+use clap::Args;
 use glam::{DVec3, UVec2, UVec3};
+use saccade_archive::{ArchiveLocation, CatalogLocation, LocationError, StorageLocation};
 use saccade_core::volume::check_name;
+
+/// The visualization archive that a command works on.
+#[derive(Args)]
+pub(crate) struct Archive {
+    /// Folder of the visualization archive, or s3://bucket/prefix in an object store that the
+    /// AWS_ environment variables describe; see --catalog
+    #[arg(value_name = "ARCHIVE")]
+    archive: StorageLocation,
+
+    #[command(flatten)]
+    catalog: CatalogArgument,
+}
+
+/// Where the catalog is, if it is not in the archive's folder.
+#[derive(Args, Clone)]
+pub(crate) struct CatalogArgument {
+    /// The catalog's file on a local disk, where the archive is in an object store
+    /// [default: catalog.sqlite in the archive's folder]
+    #[arg(long, value_name = "FILE")]
+    catalog: Option<CatalogLocation>,
+}
+
+impl Archive {
+    pub(crate) fn location(&self) -> Result<ArchiveLocation, LocationError> {
+        self.catalog.location(self.archive.clone())
+    }
+}
+
+impl CatalogArgument {
+    pub(crate) fn location(
+        &self,
+        storage: StorageLocation,
+    ) -> Result<ArchiveLocation, LocationError> {
+        ArchiveLocation::new(storage, self.catalog.clone())
+    }
+
+    pub(crate) fn is_given(&self) -> bool {
+        self.catalog.is_some()
+    }
+}
 
 /// Three whole numbers above 0, as `x,y,z`.
 pub(crate) fn extent(text: &str) -> Result<UVec3, String> {

@@ -42,6 +42,7 @@ fn main() -> ExitCode {
     // Prints usage errors itself, and ends with 2.
     let CommandLine { command } = CommandLine::parse();
     report::log_to_stderr();
+    saccade_archive::tls::provide();
     let runtime = match tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()

@@ -1,18 +1,17 @@
 //! Volumes that the command line names: of a server or of an archive.
 
-use std::convert::Infallible;
-use std::path::PathBuf;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
-use saccade_archive::VisualizationArchive;
+use anyhow::{Context, Result, bail, ensure};
+use saccade_archive::{LocationError, StorageLocation, VisualizationArchive};
 use saccade_serve::{CatalogStatus, StatusSource};
 use saccade_source::VolumeSource;
 use saccade_source::remote::{Quarantined, RemoteSource, Status, volumes};
 use saccade_source::stitched::StitchedSource;
 use saccade_view::AcquisitionReader;
 
+use crate::arguments::CatalogArgument;
 use crate::stitching::Stitching;
 
 /// Where a volume is.
@@ -20,18 +19,18 @@ use crate::stitching::Stitching;
 pub(crate) enum Place {
     /// The address of a server.
     Server(String),
-    /// The folder of a visualization archive.
-    Archive(PathBuf),
+    /// A visualization archive.
+    Archive(StorageLocation),
 }
 
 impl FromStr for Place {
-    type Err = Infallible;
-    fn from_str(text: &str) -> Result<Self, Infallible> {
+    type Err = LocationError;
+    fn from_str(text: &str) -> Result<Self, LocationError> {
         let server = text.starts_with("http://") || text.starts_with("https://");
         Ok(if server {
             Self::Server(text.to_owned())
         } else {
-            Self::Archive(text.into())
+            Self::Archive(text.parse()?)
         })
     }
 }
@@ -44,9 +43,18 @@ pub(crate) struct Opened {
 
 impl Place {
     /// Opens the volume of that name, or the first; one of an archive is stitched as told.
-    pub(crate) async fn open(&self, name: Option<&str>, stitching: &Stitching) -> Result<Opened> {
+    pub(crate) async fn open(
+        &self,
+        catalog: &CatalogArgument,
+        name: Option<&str>,
+        stitching: &Stitching,
+    ) -> Result<Opened> {
         match self {
             Self::Server(address) => {
+                ensure!(
+                    !catalog.is_given(),
+                    "a server has its own catalog: leave out --catalog"
+                );
                 let name = match name {
                     Some(name) => name.to_owned(),
                     None => match volumes(address).await?.into_iter().next() {
@@ -65,22 +73,22 @@ impl Place {
                     acquisition: Some(acquisition),
                 })
             }
-            Self::Archive(folder) => {
-                let archive = VisualizationArchive::open(folder).await?;
+            Self::Archive(storage) => {
+                let location = catalog.location(storage.clone())?;
+                let archive = VisualizationArchive::open(&location).await?;
                 let name = match name {
                     Some(name) => name.to_owned(),
                     None => match archive.catalog().volumes().await?.into_iter().next() {
                         Some(entry) => entry.volume.name,
                         None => bail!(
-                            "the archive holds no volumes yet; `saccade ingest` fills it: {}",
-                            folder.display()
+                            "the archive holds no volumes yet; `saccade ingest` fills it: {location}"
                         ),
                     },
                 };
                 let options = stitching.options().await;
                 let source = StitchedSource::open(&archive, &name, options)
                     .await
-                    .with_context(|| format!("cannot open a volume of {}", folder.display()))?;
+                    .with_context(|| format!("cannot open a volume of {location}"))?;
                 let status = CatalogStatus::new(archive.catalog().clone(), &name);
                 let acquisition: AcquisitionReader = Arc::new(move || {
                     let status = status.clone();

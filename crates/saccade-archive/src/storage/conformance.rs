@@ -1,6 +1,7 @@
 //! What every [`Storage`] must do. All implementations run it, also those of other crates.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 
@@ -22,6 +23,7 @@ pub async fn check(storage: Arc<dyn Storage>) {
     objects_come_back_whole_and_in_parts(storage).await;
     later_writes_win(storage).await;
     lists_are_sorted_and_cut_by_prefix(storage).await;
+    names_are_listed_as_written(storage).await;
     bad_names_are_refused(storage).await;
     readers_see_whole_objects(storage).await;
     for name in names(storage, "").await {
@@ -108,6 +110,26 @@ async fn lists_are_sorted_and_cut_by_prefix(storage: &dyn Storage) {
     assert_eq!(names(storage, "l/a").await, ["l/a/z"]);
     assert_eq!(names(storage, "l/a/z").await, ["l/a/z"]);
     assert_eq!(names(storage, "nothing/like/it").await, [""; 0]);
+    let entries = storage.entries("l/a").await.expect("entries");
+    assert_eq!(entries.len(), 1);
+    assert_eq!((entries[0].name.as_str(), entries[0].size), ("l/a/z", 1));
+    let age = entries[0]
+        .modified
+        .map(|at| at.elapsed().unwrap_or_default());
+    assert!(
+        age.is_none_or(|age| age < Duration::from_secs(3600)),
+        "{age:?}"
+    );
+}
+
+/// Some stores must encode them.
+async fn names_are_listed_as_written(storage: &dyn Storage) {
+    let odd = "odd/a b~c%7Ed#e?f[1]/Zellkörper*.tif";
+    write(storage, odd, b"odd").await;
+    assert_eq!(names(storage, "odd/").await, [odd]);
+    assert_eq!(names(storage, "odd/a b~c%7E").await, [odd]);
+    assert_eq!(storage.read(odd, None).await.expect("read"), b"odd"[..]);
+    storage.delete(odd).await.expect("delete");
 }
 
 async fn bad_names_are_refused(storage: &dyn Storage) {

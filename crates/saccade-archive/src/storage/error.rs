@@ -28,6 +28,38 @@ pub enum StorageError {
         /// File or object.
         path: String,
     },
+    /// The disk did not keep what was written. Nothing more is written until someone has looked at it
+    /// and started anew; what was acknowledged before is not affected.
+    #[error(
+        "the disk could not keep what was written, and nothing more is written to it; look for disk \
+         errors in the system's log, mend or replace the disk, then start again: {path}"
+    )]
+    NotKept {
+        /// What the system said.
+        source: io::Error,
+        /// File or folder that was to be kept.
+        path: String,
+    },
+    /// An object store refuses, and will until someone changes something.
+    #[error("{advice}: {path}")]
+    Refused {
+        /// What the store said.
+        source: Box<object_store::Error>,
+        /// What is wrong, and how to mend it.
+        advice: &'static str,
+        /// The object, or the bucket.
+        path: String,
+    },
+    /// An object store does not answer, or says that it is overloaded. It was asked several times.
+    #[error(
+        "the object store does not do its work at present; check the network and the store: {path}"
+    )]
+    Unavailable {
+        /// What the store said, or the network.
+        source: Box<object_store::Error>,
+        /// The object, or the bucket.
+        path: String,
+    },
     /// A name that no object can have: the caller's mistake.
     #[error("{name:?} cannot name an object: {reason}")]
     Name {
@@ -65,6 +97,11 @@ impl StorageError {
 
     /// Whether the same request may succeed later without anyone changing the request.
     pub fn is_transient(&self) -> bool {
-        matches!(self, Self::Full { .. } | Self::Io { .. })
+        self.is_outage() || matches!(self, Self::Io { .. })
+    }
+
+    /// Whether nothing but waiting helps, however long: the disk is full, the object store is away.
+    pub fn is_outage(&self) -> bool {
+        matches!(self, Self::Full { .. } | Self::Unavailable { .. })
     }
 }

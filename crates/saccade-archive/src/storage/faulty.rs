@@ -7,7 +7,7 @@ use bytes::Bytes;
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
 
-use super::{Storage, StorageError};
+use super::{Entry, Storage, StorageError};
 
 /// What befalls a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -213,10 +213,10 @@ impl Storage for FaultyStorage {
         .boxed()
     }
 
-    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
         async move {
             self.alive(prefix)?;
-            self.inner.list(prefix).await
+            self.inner.entries(prefix).await
         }
         .boxed()
     }
@@ -235,6 +235,10 @@ impl Storage for FaultyStorage {
             self.inner.size(name).await
         }
         .boxed()
+    }
+
+    fn read_cost(&self) -> u64 {
+        self.inner.read_cost()
     }
 }
 

@@ -1,16 +1,16 @@
-use std::fs::{self, File};
-use std::io::{self, Read as _, Seek as _, SeekFrom, Write as _};
+use std::collections::BTreeSet;
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
 use futures::FutureExt as _;
 use futures::future::BoxFuture;
 
-use super::memory::cut;
-use super::{Storage, StorageError, check_name};
+use super::disk::{Disk, SystemDisk};
+use super::{Entry, Storage, StorageError, check_name};
 
 /// Where unfinished writes live, below the root. No object's name begins with a dot.
 const INCOMING: &str = ".incoming";
@@ -25,9 +25,34 @@ static NEXT: AtomicU64 = AtomicU64::new(0);
 ///
 /// A write goes to a temporary file, which is synced, renamed to its name, and made permanent by
 /// syncing the folder: one sync of each per object. Runs on tokio's threads for blocking work.
+///
+/// A sync that fails may have lost what was written, and the next one says nothing of it. After such a
+/// failure, unless the disk was merely full, nothing more is written here
+/// ([`StorageError::NotKept`]): reading goes on.
 #[derive(Clone, Debug)]
-pub struct LocalStorage {
-    root: Arc<Path>,
+pub struct LocalStorage(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    disk: Arc<dyn Disk>,
+    root: PathBuf,
+    /// Folders whose names are durable, as this process has seen to. Others may have been made by
+    /// a process that died before it synced them.
+    kept: Mutex<BTreeSet<PathBuf>>,
+    /// Whether a sync has failed.
+    stopped: AtomicBool,
+}
+
+/// What went wrong with a step of a write.
+enum WriteError {
+    Io(io::Error),
+    Sync(io::Error),
+}
+
+impl From<io::Error> for WriteError {
+    fn from(error: io::Error) -> Self {
+        Self::Io(error)
+    }
 }
 
 impl LocalStorage {
@@ -40,41 +65,64 @@ impl LocalStorage {
     ///
     /// [`StorageError`] if the folder cannot be created or listed.
     pub fn new(root: impl Into<PathBuf>) -> Result<Self, StorageError> {
-        let storage = Self {
-            root: root.into().into(),
-        };
-        let incoming = storage.root.join(INCOMING);
+        Self::on(Arc::new(SystemDisk), root)
+    }
+
+    /// The same on another file system than the system's.
+    ///
+    /// # Errors
+    ///
+    /// As [`new`](Self::new).
+    pub fn on(disk: Arc<dyn Disk>, root: impl Into<PathBuf>) -> Result<Self, StorageError> {
+        let storage = Self(Arc::new(Inner {
+            disk,
+            root: root.into(),
+            kept: Mutex::default(),
+            stopped: AtomicBool::new(false),
+        }));
+        let inner = &*storage.0;
+        let incoming = inner.root.join(INCOMING);
         let sort = |e| StorageError::new(e, INCOMING, incoming.display().to_string());
-        match create_dirs(&incoming).map_err(sort) {
-            Err(StorageError::Denied { .. }) if fs::read_dir(&storage.root).is_ok() => {
+        match inner
+            .prepare(&incoming)
+            .map_err(|e| inner.sorted(e, INCOMING, &incoming))
+        {
+            Err(StorageError::Denied { .. }) if inner.disk.read_dir(&inner.root).is_ok() => {
                 return Ok(storage);
             }
-            created => created?,
+            prepared => prepared?,
         }
-        for entry in fs::read_dir(&incoming).map_err(sort)? {
-            remove_if_abandoned(&entry.map_err(sort)?.path());
+        for entry in inner.disk.read_dir(&incoming).map_err(sort)? {
+            let path = incoming.join(entry.name);
+            match inner.disk.remove_if_unlocked(&path) {
+                Err(e) if e.kind() != io::ErrorKind::NotFound => log::warn!(
+                    "cannot remove an abandoned temporary file: {e}: {}",
+                    path.display()
+                ),
+                Ok(()) | Err(_) => {}
+            }
         }
         Ok(storage)
     }
 
     /// The folder.
     pub fn root(&self) -> &Path {
-        &self.root
+        &self.0.root
     }
 
     /// Runs `work` with the object's path where it may block.
     fn blocking<T: Send + 'static>(
         &self,
         name: &str,
-        work: impl FnOnce(&Self, &Path) -> io::Result<T> + Send + 'static,
+        work: impl FnOnce(&Inner, &Path) -> Result<T, WriteError> + Send + 'static,
     ) -> BoxFuture<'static, Result<T, StorageError>> {
-        let (storage, name) = (self.clone(), name.to_owned());
+        let (inner, name) = (self.0.clone(), name.to_owned());
         async move {
             check_name(&name)?;
-            let path = storage.root.join(&name);
+            let path = inner.root.join(&name);
             let task = tokio::task::spawn_blocking(move || {
-                let result = work(&storage, &path);
-                result.map_err(|e| StorageError::new(e, &name, path.display().to_string()))
+                let result = work(&inner, &path);
+                result.map_err(|e| inner.sorted(e, &name, &path))
             });
             task.await.unwrap_or_else(|e| {
                 let (source, path) = (io::Error::other(e), String::new());
@@ -83,108 +131,140 @@ impl LocalStorage {
         }
         .boxed()
     }
+}
 
-    fn write(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
+impl Inner {
+    fn sorted(&self, error: WriteError, name: &str, path: &Path) -> StorageError {
+        let path = path.display().to_string();
+        match error {
+            WriteError::Io(e) => StorageError::new(e, name, path),
+            WriteError::Sync(e) => match StorageError::new(e, name, path) {
+                // Everything is written anew once there is space.
+                full @ StorageError::Full { .. } => full,
+                StorageError::Denied { source, path } | StorageError::Io { source, path } => {
+                    self.stopped.store(true, Ordering::SeqCst);
+                    StorageError::NotKept { source, path }
+                }
+                other => other,
+            },
+        }
+    }
+
+    fn write(&self, path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
+        if self.stopped.load(Ordering::SeqCst) {
+            let stopped = io::Error::other("an earlier sync failed, and nothing more is written");
+            return Err(WriteError::Sync(stopped));
+        }
         let parent = path.parent().unwrap_or(&self.root);
-        create_dirs(parent)?;
+        let incoming = self.root.join(INCOMING);
         for _ in 1..WRITE_ATTEMPTS {
-            match self.write_once(path, bytes) {
-                Ok(()) => return sync_dir(parent),
+            let prepared = self.prepare(&incoming).and_then(|()| self.prepare(parent));
+            match prepared.and_then(|()| self.write_once(path, bytes)) {
+                Ok(()) => return self.disk.sync_dir(parent).map_err(WriteError::Sync),
                 // Another process cleaned up between this one's creating and locking the file, or
                 // someone emptied the whole folder.
-                Err(e) if e.kind() == io::ErrorKind::NotFound => {
-                    create_dirs(&self.root.join(INCOMING))?;
-                    create_dirs(parent)?;
+                Err(WriteError::Io(e)) if e.kind() == io::ErrorKind::NotFound => {
+                    self.kept().clear();
                 }
                 // A process of the same number, on another machine or before this one.
-                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(WriteError::Io(e)) if e.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(e) => return Err(e),
             }
         }
-        Err(io::Error::other("other writers keep interfering"))
+        Err(io::Error::other("other writers keep interfering").into())
     }
 
-    fn write_once(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
+    fn write_once(&self, path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let temporary = self
             .root
             .join(INCOMING)
             .join(format!("{}-{number}", std::process::id()));
-        let mut file = File::create_new(&temporary)?;
+        let mut file = self.disk.create_new(&temporary)?;
         // Tells a cleaner that the writer lives. Where locks do not exist, cleaners get none.
-        let _ = file.try_lock();
+        file.lock();
         let mut write = || {
             file.write_all(bytes)?;
-            file.sync_all()?;
-            fs::rename(&temporary, path)
+            file.sync().map_err(WriteError::Sync)?;
+            Ok(self.disk.rename(&temporary, path)?)
         };
         write().inspect_err(|_| {
             // Without this a full disk would stay full; a failure here changes nothing.
-            let _ = fs::remove_file(&temporary);
+            let _ = self.disk.remove_file(&temporary);
         })
     }
-}
 
-/// Removes a temporary file unless its writer holds the lock.
-fn remove_if_abandoned(path: &Path) {
-    if let Ok(file) = File::open(path)
-        && file.try_lock().is_ok()
-        && let Err(e) = fs::remove_file(path)
-    {
-        log::warn!(
-            "cannot remove an abandoned temporary file: {e}: {}",
-            path.display()
-        );
-    }
-}
-
-/// Creates a folder and those above it, each entered durably in the one that holds it.
-fn create_dirs(path: &Path) -> io::Result<()> {
-    if path.as_os_str().is_empty() || path.is_dir() {
-        return Ok(());
-    }
-    let parent = path
-        .parent()
-        .filter(|p| !p.as_os_str().is_empty())
-        .unwrap_or(Path::new("."));
-    create_dirs(parent)?;
-    match fs::create_dir(path) {
-        Err(e) if e.kind() == io::ErrorKind::AlreadyExists && path.is_dir() => Ok(()),
-        Err(e) => Err(e),
-        Ok(()) => sync_dir(parent),
-    }
-}
-
-fn sync_dir(path: &Path) -> io::Result<()> {
-    File::open(path)?.sync_all()
-}
-
-/// Adds the names of the files below `dir` to `names`; `at` is the folder's own name with a slash.
-fn walk(dir: &Path, at: &str, prefix: &str, names: &mut Vec<String>) -> io::Result<()> {
-    let entries = match fs::read_dir(dir) {
-        // Removed since its parent was read.
-        Err(e) if e.kind() == io::ErrorKind::NotFound && !at.is_empty() => return Ok(()),
-        entries => entries?,
-    };
-    for entry in entries {
-        let entry = entry?;
-        let Ok(part) = entry.file_name().into_string() else {
-            continue;
-        };
-        let name = format!("{at}{part}");
-        if part.starts_with('.') {
-            continue;
+    /// Sees to it that a folder is there, and those above it down from the root, each entered
+    /// durably in the one that holds it. Whoever made it may have died, or still be about to.
+    fn prepare(&self, path: &Path) -> Result<(), WriteError> {
+        if path.as_os_str().is_empty() || self.kept().contains(path) {
+            return Ok(());
         }
-        if entry.file_type()?.is_dir() {
-            let below = name + "/";
-            if below.starts_with(prefix) || prefix.starts_with(&below) {
-                walk(&entry.path(), &below, prefix, names)?;
+        let exists = self.disk.metadata(path).is_ok_and(|m| m.is_dir);
+        let above_root = !path.starts_with(&self.root) || path == self.root;
+        if exists && above_root {
+            return Ok(());
+        }
+        let parent = path
+            .parent()
+            .filter(|p| !p.as_os_str().is_empty())
+            .unwrap_or(Path::new("."));
+        self.prepare(parent)?;
+        if !exists {
+            match self.disk.create_dir(path) {
+                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
+                made => made?,
             }
-        } else if name.starts_with(prefix) {
-            names.push(name);
+            if !self.disk.metadata(path)?.is_dir {
+                return Err(io::Error::from(io::ErrorKind::NotADirectory).into());
+            }
         }
+        self.disk.sync_dir(parent).map_err(WriteError::Sync)?;
+        self.kept().insert(path.to_owned());
+        Ok(())
     }
-    Ok(())
+
+    fn kept(&self) -> std::sync::MutexGuard<'_, BTreeSet<PathBuf>> {
+        // Every change is a single insertion or a clearing: whole even after a panic.
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Adds the files below `dir` to `found`; `at` is the folder's own name with a slash.
+    fn walk(&self, dir: &Path, at: &str, prefix: &str, found: &mut Vec<Entry>) -> io::Result<()> {
+        let gone = |e: &io::Error| e.kind() == io::ErrorKind::NotFound;
+        let entries = match self.disk.read_dir(dir) {
+            // Removed since its parent was read.
+            Err(e) if gone(&e) && !at.is_empty() => return Ok(()),
+            entries => entries?,
+        };
+        for entry in entries {
+            let path = dir.join(&entry.name);
+            let Ok(part) = entry.name.into_string() else {
+                continue;
+            };
+            let name = format!("{at}{part}");
+            if part.starts_with('.') {
+                continue;
+            }
+            if entry.is_dir {
+                let below = name + "/";
+                if below.starts_with(prefix) || prefix.starts_with(&below) {
+                    self.walk(&path, &below, prefix, found)?;
+                }
+            } else if name.starts_with(prefix) {
+                let metadata = match self.disk.metadata(&path) {
+                    Err(e) if gone(&e) => continue,
+                    metadata => metadata?,
+                };
+                found.push(Entry {
+                    name,
+                    size: metadata.len,
+                    modified: metadata.modified,
+                });
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Storage for LocalStorage {
@@ -193,18 +273,7 @@ impl Storage for LocalStorage {
         name: &'a str,
         range: Option<Range<u64>>,
     ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
-        self.blocking(name, |_, path| {
-            let mut file = File::open(path)?;
-            let cut = cut(range, file.metadata()?.len());
-            let len = cut.end - cut.start;
-            file.seek(SeekFrom::Start(cut.start))?;
-            let mut bytes = Vec::new();
-            bytes
-                .try_reserve_exact(usize::try_from(len).unwrap_or(usize::MAX))
-                .map_err(|_| io::ErrorKind::OutOfMemory)?;
-            file.take(len).read_to_end(&mut bytes)?;
-            Ok(bytes.into())
-        })
+        self.blocking(name, |inner, path| Ok(inner.disk.read(path, range)?))
     }
 
     fn write_durable<'a>(
@@ -212,18 +281,20 @@ impl Storage for LocalStorage {
         name: &'a str,
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>> {
-        self.blocking(name, move |storage, path| storage.write(path, &bytes))
+        self.blocking(name, move |inner, path| inner.write(path, &bytes))
     }
 
-    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
-        let (root, prefix) = (self.root.clone(), prefix.to_owned());
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+        let (inner, prefix) = (self.0.clone(), prefix.to_owned());
         async move {
             let task = tokio::task::spawn_blocking(move || {
-                let mut names = Vec::new();
-                let failed = |e| StorageError::new(e, &prefix, root.display().to_string());
-                walk(&root, "", &prefix, &mut names).map_err(failed)?;
-                names.sort_unstable();
-                Ok(names)
+                let mut found: Vec<Entry> = Vec::new();
+                let failed = |e| StorageError::new(e, &prefix, inner.root.display().to_string());
+                inner
+                    .walk(&inner.root, "", &prefix, &mut found)
+                    .map_err(failed)?;
+                found.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+                Ok(found)
             });
             task.await.unwrap_or_else(|e| {
                 let (source, path) = (io::Error::other(e), String::new());
@@ -234,22 +305,26 @@ impl Storage for LocalStorage {
     }
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
-        self.blocking(name, |storage, path| match fs::remove_file(path) {
+        self.blocking(name, |inner, path| match inner.disk.remove_file(path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
-            Err(e) => Err(e),
-            Ok(()) => sync_dir(path.parent().unwrap_or(&storage.root)),
+            Err(e) => Err(e.into()),
+            Ok(()) => {
+                let parent = path.parent().unwrap_or(&inner.root);
+                inner.disk.sync_dir(parent).map_err(WriteError::Sync)
+            }
         })
     }
 
     fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
-        self.blocking(name, |_, path| Ok(fs::metadata(path)?.len()))
+        self.blocking(name, |inner, path| Ok(inner.disk.metadata(path)?.len))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
+    use std::fs::{self, File};
 
+    use super::super::SimulatedDisk;
     use super::*;
 
     #[tokio::test]
@@ -257,6 +332,73 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let storage = LocalStorage::new(dir.path().join("deep/root")).unwrap();
         super::super::conformance::check(Arc::new(storage)).await;
+    }
+
+    #[tokio::test]
+    async fn conforms_on_a_simulated_disk() {
+        let storage = LocalStorage::on(Arc::new(SimulatedDisk::new()), "deep/root").unwrap();
+        super::super::conformance::check(Arc::new(storage)).await;
+    }
+
+    /// Whichever sync fails: nothing that was acknowledged is lost, and the storage says why it stops.
+    #[tokio::test]
+    async fn after_a_failed_sync_nothing_more_is_written() {
+        let mut stopped = 0;
+        for nth in 0..20 {
+            let disk = SimulatedDisk::new();
+            let storage = LocalStorage::on(Arc::new(disk.clone()), "root").unwrap();
+            disk.fail_sync_at(nth);
+            let mut acknowledged = Vec::new();
+            let mut failed = None;
+            for name in ["tiles/a", "tiles/b", "tiles/c/d", "tiles/a"] {
+                match storage
+                    .write_durable(name, Bytes::from_static(b"abc"))
+                    .await
+                {
+                    Ok(()) => acknowledged.push(name),
+                    Err(e) => failed = failed.or(Some(e)),
+                }
+            }
+            let Some(error) = failed else {
+                assert_eq!(acknowledged.len(), 4);
+                continue;
+            };
+            stopped += 1;
+            assert!(matches!(error, StorageError::NotKept { .. }), "{error:?}");
+            assert!(!error.is_transient());
+            let again = storage.write_durable("e", Bytes::new()).await;
+            assert!(
+                matches!(again, Err(StorageError::NotKept { .. })),
+                "{again:?}"
+            );
+            for seed in 0..20 {
+                let left = disk.after_crash(&mut super::super::Crash::new(seed));
+                let left = LocalStorage::on(Arc::new(left), "root").unwrap();
+                for name in &acknowledged {
+                    let read = left.read(name, None).await.unwrap();
+                    assert_eq!(read, b"abc"[..], "{name}, sync {nth}, seed {seed}");
+                }
+            }
+        }
+        assert!(stopped > 5, "only {stopped} syncs failed");
+    }
+
+    /// Its maker died before it was entered durably in the folder above.
+    #[tokio::test]
+    async fn folders_that_others_made_are_made_durable() {
+        let disk = SimulatedDisk::new();
+        let storage = LocalStorage::on(Arc::new(disk.clone()), "root").unwrap();
+        disk.create_dir(Path::new("root/tiles")).unwrap();
+        disk.create_dir(Path::new("root/tiles/v")).unwrap();
+        storage
+            .write_durable("tiles/v/a", Bytes::from_static(b"abc"))
+            .await
+            .unwrap();
+        for seed in 0..50 {
+            let left = disk.after_crash(&mut super::super::Crash::new(seed));
+            let read = left.read(Path::new("root/tiles/v/a"), None).unwrap();
+            assert_eq!(read, b"abc"[..]);
+        }
     }
 
     #[tokio::test]

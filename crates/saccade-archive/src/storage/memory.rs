@@ -1,17 +1,18 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::SystemTime;
 
 use bytes::Bytes;
 use futures::FutureExt as _;
 use futures::future::{BoxFuture, ready};
 
-use super::{Storage, StorageError, check_name};
+use super::{Entry, Storage, StorageError, check_name};
 
 /// Objects in memory, for tests and for demonstrations that leave nothing behind.
 #[derive(Debug, Default)]
 pub struct MemoryStorage {
-    objects: Mutex<BTreeMap<String, Bytes>>,
+    objects: Mutex<BTreeMap<String, (Bytes, SystemTime)>>,
 }
 
 impl MemoryStorage {
@@ -20,14 +21,14 @@ impl MemoryStorage {
         Self::default()
     }
 
-    fn objects(&self) -> MutexGuard<'_, BTreeMap<String, Bytes>> {
+    fn objects(&self) -> MutexGuard<'_, BTreeMap<String, (Bytes, SystemTime)>> {
         // Every change below is a single insertion or removal: whole even after a panic.
         self.objects.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn get(&self, name: &str) -> Result<Bytes, StorageError> {
         check_name(name)?;
-        let found = self.objects().get(name).cloned();
+        let found = self.objects().get(name).map(|(bytes, _)| bytes.clone());
         found.ok_or_else(|| StorageError::NotFound {
             name: name.to_owned(),
         })
@@ -61,19 +62,24 @@ impl Storage for MemoryStorage {
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>> {
         ready(check_name(name).map(|()| {
-            self.objects().insert(name.to_owned(), bytes);
+            let object = (bytes, SystemTime::now());
+            self.objects().insert(name.to_owned(), object);
         }))
         .boxed()
     }
 
-    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
-        let names = self
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+        let entries = self
             .objects()
-            .keys()
-            .filter(|n| n.starts_with(prefix))
-            .cloned()
+            .iter()
+            .filter(|(name, _)| name.starts_with(prefix))
+            .map(|(name, (bytes, modified))| Entry {
+                name: name.clone(),
+                size: bytes.len() as u64,
+                modified: Some(*modified),
+            })
             .collect();
-        ready(Ok(names)).boxed()
+        ready(Ok(entries)).boxed()
     }
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {

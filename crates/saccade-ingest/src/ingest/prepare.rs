@@ -13,7 +13,7 @@ use saccade_archive::acquisition::{
 use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
-use saccade_archive::storage::{Storage, StorageError};
+use saccade_archive::storage::Storage;
 use saccade_core::volume::Dtype;
 
 use super::IngestError;
@@ -217,7 +217,7 @@ impl Context<'_> {
         Ok(Outcome::Tile { tile, pixels })
     }
 
-    /// Writes a pyramid; waits as long as the disk is full.
+    /// Writes a pyramid; waits as long as the disk is full or the object store away.
     async fn write(&self, tile: &str, name: &str, pyramid: Bytes) -> Result<(), IngestError> {
         let mut backoff = Backoff::new(self.retry);
         loop {
@@ -229,8 +229,7 @@ impl Context<'_> {
                     return Ok(());
                 }
                 Err(e) => {
-                    let full = matches!(e, StorageError::Full { .. });
-                    if !backoff.may_go_on(full, e.is_transient()) {
+                    if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
                         return Err(IngestError::Storage {
                             source: e,
                             tile: tile.to_owned(),
@@ -323,10 +322,10 @@ impl Backoff {
         }
     }
 
-    /// Counts a failure. A full disk is waited out; what may pass is tried some times.
-    pub(super) fn may_go_on(&mut self, full: bool, transient: bool) -> bool {
+    /// Counts a failure. An outage is waited out; what may pass is tried some times.
+    pub(super) fn may_go_on(&mut self, outage: bool, transient: bool) -> bool {
         self.failures += 1;
-        full || (transient && self.failures < Self::ATTEMPTS)
+        outage || (transient && self.failures < Self::ATTEMPTS)
     }
 
     pub(super) async fn say_and_wait(

@@ -85,6 +85,7 @@ async fn serve_source(
     oneshot::Sender<()>,
     JoinHandle<Result<(), ServeError>>,
 ) {
+    saccade_archive::tls::provide();
     let volumes = Volumes::new();
     volumes.publish(source, None);
     let server = Server::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))

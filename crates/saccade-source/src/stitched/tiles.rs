@@ -16,9 +16,6 @@ use saccade_archive::pyramid::{PyramidIndex, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_archive::storage::Storage;
 use saccade_core::volume::Dtype;
 
-/// Bytes that are rather read and thrown away than left out by a further read.
-const GAP: u64 = 16 << 10;
-
 /// An opened pyramid.
 pub(super) struct Pyramid {
     pub(super) index: PyramidIndex,
@@ -225,7 +222,8 @@ impl Tiles {
                 None => missing.push(at),
             }
         }
-        let reads = pyramid.index.reads(level as usize, missing, GAP);
+        let gap = self.storage.read_cost();
+        let reads = pyramid.index.reads(level as usize, missing, gap);
         let name = pyramid.index.name();
         let read = reads.iter().map(async |read| {
             let bytes = self.storage.read(name, Some(read.range.clone())).await;

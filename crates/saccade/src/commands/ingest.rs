@@ -8,7 +8,7 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::pyramid::Encoding;
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
 
-use crate::arguments::volume_name;
+use crate::arguments::{Archive, volume_name};
 use crate::interrupt::cancel_when_interrupted;
 use crate::progress::Shown;
 use crate::report::say;
@@ -19,8 +19,8 @@ pub(crate) struct Ingest {
     /// Folder that the microscope writes to
     acquisition: PathBuf,
 
-    /// Folder of the visualization archive; made if it is not there
-    archive: PathBuf,
+    #[command(flatten)]
+    archive: Archive,
 
     /// End once everything that is there is done, instead of following
     #[arg(long)]
@@ -90,8 +90,11 @@ impl Ingest {
     pub(crate) async fn run(self) -> Result<()> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
         saccade_archive::acquisition::AcquisitionInfo::read(&self.acquisition)?;
-        refuse_same_folder(&self.acquisition, &self.archive)?;
-        let archive = VisualizationArchive::create(&self.archive).await?;
+        let location = self.archive.location()?;
+        if let Some(folder) = location.folder() {
+            refuse_same_folder(&self.acquisition, folder)?;
+        }
+        let archive = VisualizationArchive::create(&location).await?;
         let options = IngestOptions {
             volume: self.volume,
             encoding: self.stored.encoding(),
@@ -121,7 +124,7 @@ impl Ingest {
         if early > 0 {
             done.push_str(&format!(", {early} transforms of tiles that have not come"));
         }
-        say(&format!("{done}: {}", self.archive.display()));
+        say(&format!("{done}: {location}"));
         Ok(())
     }
 }

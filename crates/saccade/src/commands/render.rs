@@ -12,7 +12,7 @@ use saccade_render::{Gpu, View};
 use saccade_stream::{Session, SessionOptions, SettleError, Status};
 use saccade_view::background_from_text;
 
-use crate::arguments::{picture, picture_size, seconds};
+use crate::arguments::{CatalogArgument, picture, picture_size, seconds};
 use crate::open::Place;
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
@@ -20,9 +20,13 @@ use crate::stitching::Stitching;
 /// Draw a volume into a PNG file. Waits until the picture is complete.
 #[derive(Args)]
 pub(crate) struct Render {
-    /// Address of a server, or folder of a visualization archive
+    /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
+    /// --catalog
     #[arg(value_name = "URL|ARCHIVE")]
     place: Place,
+
+    #[command(flatten)]
+    catalog: CatalogArgument,
 
     /// The PNG file to write
     #[arg(short, long, value_name = "FILE", value_parser = picture)]
@@ -80,7 +84,7 @@ impl Render {
         let transfer = self.transfer_function()?;
         let source = self
             .place
-            .open(self.volume.as_deref(), &self.stitching)
+            .open(&self.catalog, self.volume.as_deref(), &self.stitching)
             .await?
             .source;
         let gpu = Gpu::headless().await?;

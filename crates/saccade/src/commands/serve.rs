@@ -1,7 +1,6 @@
 //! `saccade serve`: an archive over HTTP.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Result;
@@ -9,6 +8,7 @@ use clap::Args;
 use saccade_archive::VisualizationArchive;
 use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, offer_archive};
 
+use crate::arguments::Archive;
 use crate::interrupt::interrupted;
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
@@ -16,8 +16,8 @@ use crate::stitching::Stitching;
 /// Offer the volumes of an archive over HTTP, with the browser application.
 #[derive(Args)]
 pub(crate) struct Serve {
-    /// Folder of the visualization archive
-    archive: PathBuf,
+    #[command(flatten)]
+    archive: Archive,
 
     #[command(flatten)]
     at: At,
@@ -73,7 +73,7 @@ const POLL: Duration = Duration::from_secs(2);
 
 impl Serve {
     pub(crate) async fn run(self) -> Result<()> {
-        let archive = VisualizationArchive::open(&self.archive).await?;
+        let archive = VisualizationArchive::open(&self.archive.location()?).await?;
         let server = Server::bind(self.at.address()).await?;
         let volumes = Volumes::new();
         let options = self.stitching.options().await;

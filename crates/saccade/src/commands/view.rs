@@ -5,15 +5,20 @@ use clap::Args;
 use saccade_core::camera::Camera;
 use saccade_view::{SourceSpec, ViewOptions, background_from_text, run};
 
+use crate::arguments::CatalogArgument;
 use crate::open::{Opened, Place};
 use crate::stitching::Stitching;
 
 /// Look at a volume in a window of its own.
 #[derive(Args)]
 pub(crate) struct View {
-    /// Address of a server, or folder of a visualization archive
+    /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
+    /// --catalog
     #[arg(value_name = "URL|ARCHIVE")]
     place: Place,
+
+    #[command(flatten)]
+    catalog: CatalogArgument,
 
     /// Name of the volume [default: the first]
     #[arg(long)]
@@ -43,7 +48,7 @@ impl View {
             acquisition,
         } = self
             .place
-            .open(self.volume.as_deref(), &self.stitching)
+            .open(&self.catalog, self.volume.as_deref(), &self.stitching)
             .await?;
         let options = ViewOptions {
             camera: self.camera,

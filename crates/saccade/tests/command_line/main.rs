@@ -50,6 +50,8 @@ impl Running {
     /// Starts something that prints an address first.
     fn start(command: &mut Command) -> (Self, String) {
         use std::io::BufRead;
+        // For those who go on to ask it.
+        saccade_archive::tls::provide();
         let mut child = command.stdout(Stdio::piped()).spawn().unwrap();
         let stdout = child.stdout.take().unwrap();
         let running = Self(child);

@@ -11,7 +11,7 @@ use futures::StreamExt;
 use futures::future::{BoxFuture, Either, FutureExt, select};
 use glam::{DVec3, UVec3};
 use proptest::prelude::*;
-use saccade_archive::storage::{MemoryStorage, Storage, StorageError};
+use saccade_archive::storage::{Entry, MemoryStorage, Storage, StorageError};
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::watch;
 
@@ -255,8 +255,8 @@ impl Storage for Gate {
         self.inner.write_durable(name, bytes)
     }
 
-    fn list<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<String>, StorageError>> {
-        self.inner.list(prefix)
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+        self.inner.entries(prefix)
     }
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {

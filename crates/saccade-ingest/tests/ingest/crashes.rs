@@ -1,0 +1,479 @@
+//! Power cuts on a simulated disk, which may lose any part of what was not synced.
+//!
+//! Each history is an ingest whose power is cut at a random step; many states that this may leave
+//! are looked at, and with one of them it goes on, until it comes to its end. The storage's own code
+//! runs over the disk, and ingest's own order of storage and catalog; a commit of the catalog, which
+//! is SQLite's matter, counts as kept whole.
+//!
+//! `SACCADE_CRASH_SEED=SEED` repeats a run, `SACCADE_CRASH_SEED=SEED:HISTORY` one of its histories.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::hash::{BuildHasher, RandomState};
+use std::io::Write;
+use std::path::Path;
+use std::pin::pin;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use bytes::Bytes;
+use futures::FutureExt as _;
+use futures::future::{BoxFuture, Either, select};
+use glam::UVec2;
+use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::Catalog;
+use saccade_archive::storage::{
+    Crash, DirEntry, Disk, Entry, LocalStorage, Metadata, OpenFile, SimulatedDisk, Storage,
+    StorageError,
+};
+use saccade_ingest::Cancel;
+use saccade_ingest::ingest::{IngestOptions, run};
+
+use crate::scope::{Scope, VOLUME, at, move_record, orphans, quick, seen, tile_record};
+
+const SIZE: UVec2 = UVec2::new(40, 30);
+const HISTORIES: u64 = 40;
+/// States looked at after each power cut.
+const STATES: u64 = 120;
+/// What one run of the test looks at, at least.
+const AT_LEAST: usize = 10_000;
+const ROOT: &str = "archive";
+
+#[tokio::test]
+async fn no_power_cut_loses_what_was_acknowledged() {
+    let (seed, only) = asked_for();
+    let stderr = || std::io::stderr();
+    let said = format!("\nsimulated power cuts, SACCADE_CRASH_SEED={seed} repeats them\n");
+    stderr().write_all(said.as_bytes()).unwrap();
+    let scene = Scene::new().await;
+    let mut found = Found::default();
+    for history in 0..HISTORIES {
+        if only.is_none_or(|only| only == history) {
+            let lived = scene.history(seed, history, &sound, &mut found).await;
+            lived.unwrap_or_else(|wrong| {
+                panic!(
+                    "{wrong}\nrepeat it: SACCADE_CRASH_SEED={seed}:{history} \
+                     cargo test -p saccade-ingest crashes"
+                )
+            });
+        }
+    }
+    let said = format!(
+        "{} states after {} power cuts, {} of them different, {} with acknowledged tiles\n",
+        found.states,
+        found.cuts,
+        found.different.len(),
+        found.with_tiles
+    );
+    stderr().write_all(said.as_bytes()).unwrap();
+    if only.is_none() {
+        assert!(found.states >= AT_LEAST, "{}", found.states);
+        assert!(found.with_tiles > AT_LEAST / 4, "{}", found.with_tiles);
+        assert!(found.different.len() > 500, "{}", found.different.len());
+    }
+}
+
+/// A suite that cannot fail proves nothing.
+#[tokio::test]
+async fn storages_that_leave_a_step_out_are_found_out() {
+    let scene = Scene::new().await;
+    let lax: [(&str, &Open); 4] = [
+        ("files are not synced", &|disk| {
+            on(Lax {
+                disk,
+                files: false,
+                folders: true,
+            })
+        }),
+        ("folders are not synced", &|disk| {
+            on(Lax {
+                disk,
+                files: true,
+                folders: false,
+            })
+        }),
+        ("files are written under their own names", &|disk| {
+            on(Naming { disk })
+        }),
+        ("writes are acknowledged before they are done", &|disk| {
+            let inner = sound(disk)?;
+            Ok(Arc::new(Hasty {
+                inner,
+                promised: Mutex::default(),
+            }))
+        }),
+    ];
+    for (what, open) in lax {
+        let mut found = Found::default();
+        let mut wrong = None;
+        for history in 0..HISTORIES {
+            wrong = scene.history(1, history, open, &mut found).await.err();
+            if wrong.is_some() {
+                break;
+            }
+        }
+        assert!(wrong.is_some(), "nobody noticed that {what}");
+    }
+}
+
+/// Seed, and the one history to repeat.
+fn asked_for() -> (u64, Option<u64>) {
+    let number = |text: &str| {
+        text.parse()
+            .expect("SACCADE_CRASH_SEED is SEED or SEED:HISTORY")
+    };
+    match std::env::var("SACCADE_CRASH_SEED") {
+        Err(_) => (RandomState::new().hash_one(0) % 1_000_000_000, None),
+        Ok(text) => match text.split_once(':') {
+            None => (number(&text), None),
+            Some((seed, history)) => (number(seed), Some(number(history))),
+        },
+    }
+}
+
+type Open = dyn Fn(SimulatedDisk) -> Result<Arc<dyn Storage>, StorageError>;
+
+fn on(disk: impl Disk + 'static) -> Result<Arc<dyn Storage>, StorageError> {
+    Ok(Arc::new(LocalStorage::on(Arc::new(disk), ROOT)?))
+}
+
+fn sound(disk: SimulatedDisk) -> Result<Arc<dyn Storage>, StorageError> {
+    on(disk)
+}
+
+/// What was looked at.
+#[derive(Default)]
+struct Found {
+    states: usize,
+    cuts: usize,
+    /// States in which the catalog named something.
+    with_tiles: usize,
+    /// Trees of files.
+    different: BTreeSet<u64>,
+}
+
+/// An acquisition, and what becomes of it when nothing happens.
+struct Scene {
+    scope: Scope,
+    options: IngestOptions,
+    /// Of every name that a pyramid may have.
+    pyramids: BTreeMap<String, Bytes>,
+    /// What there is in the end.
+    tiles: BTreeMap<String, String>,
+}
+
+impl Scene {
+    async fn new() -> Self {
+        let scope = Scope::new();
+        for n in 0..6u8 {
+            scope.tile(&format!("t{n}"), u32::from(n % 3), SIZE, n);
+        }
+        // Another image for a tile, whose old pyramid goes; and a tile that moves.
+        scope.say(&tile_record("t1", 1, SIZE));
+        scope.say(&move_record("t2", at(3.0, 4.0)));
+        scope.tile("t6", 4, SIZE, 6);
+        let options = IngestOptions {
+            // One after another: the same steps in every run.
+            batch: 1,
+            workers: 1,
+            keep_retired: Duration::ZERO,
+            ..quick()
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let archive = VisualizationArchive::create(folder.path()).await.unwrap();
+        let keep = IngestOptions {
+            keep_retired: Duration::from_secs(3600),
+            ..options.clone()
+        };
+        let summary = run(scope.path(), &archive, &keep, &(), &Cancel::new()).await;
+        assert_eq!(summary.unwrap().tiles, 8);
+        let mut pyramids = BTreeMap::new();
+        for name in archive.storage().list("tiles/").await.unwrap() {
+            let bytes = archive.storage().read(&name, None).await.unwrap();
+            pyramids.insert(name, bytes);
+        }
+        assert_eq!(pyramids.len(), 8);
+        let tiles = seen(&archive).await.into_iter();
+        Self {
+            scope,
+            options,
+            pyramids,
+            tiles: tiles.map(|(name, tile)| (name, tile.pyramid)).collect(),
+        }
+    }
+
+    /// Lives one history to its end, or says what went wrong.
+    async fn history(
+        &self,
+        seed: u64,
+        history: u64,
+        open: &Open,
+        found: &mut Found,
+    ) -> Result<(), String> {
+        let mut chance = Chance(seed.wrapping_mul(1_000_003).wrapping_add(history));
+        let folder = tempfile::tempdir().unwrap();
+        let mut disk = SimulatedDisk::new();
+        for life in 0.. {
+            let path = folder.path().join("catalog.sqlite");
+            let catalog = Catalog::create(&path).await.map_err(|e| e.to_string())?;
+            disk.cut_power_at(chance.below(if life < 6 { 45 } else { 1000 }));
+            let ended = self.live(&catalog, &disk, open).await;
+            if let Some(ended) = ended {
+                ended.map_err(|e| format!("life {life}: {e}"))?;
+                disk.cut_power_at(1 << 40);
+                let archive = VisualizationArchive::from_parts(
+                    catalog,
+                    open(disk.clone()).map_err(|e| e.to_string())?,
+                );
+                return self.is_complete(&archive, &disk).await;
+            }
+            catalog.close().await;
+            let named = named(folder.path()).await;
+            found.cuts += 1;
+            let mut next = None;
+            for state in 0..STATES {
+                let left = disk.after_crash(&mut Crash::new(chance.next()));
+                found.states += 1;
+                found.with_tiles += usize::from(!named.is_empty());
+                found.different.insert(FIXED.hash_one(left.tree()));
+                self.is_whole(&named, &left)
+                    .map_err(|e| format!("life {life}, state {state}: {e}"))?;
+                next = Some(left);
+            }
+            disk = next.expect("some states");
+        }
+        Ok(())
+    }
+
+    /// Ingests until the end, or until the power is cut: then `None`.
+    async fn live(
+        &self,
+        catalog: &Catalog,
+        disk: &SimulatedDisk,
+        open: &Open,
+    ) -> Option<Result<(), String>> {
+        let work = async {
+            let storage = open(disk.clone()).map_err(|e| e.to_string())?;
+            let archive = VisualizationArchive::from_parts(catalog.clone(), storage);
+            let cancel = Cancel::new();
+            let ingest = run(self.scope.path(), &archive, &self.options, &(), &cancel);
+            ingest.await.map_err(|e| format!("{e:?}")).map(|_| ())
+        };
+        match select(pin!(disk.power_is_off()), pin!(work)).await {
+            Either::Left(_) => None,
+            // Opening does not wait for anything: it may fail before anybody looks.
+            Either::Right((ended, off)) => match off.now_or_never() {
+                Some(()) if ended.is_err() => None,
+                _ => Some(ended),
+            },
+        }
+    }
+
+    /// Every pyramid that the catalog names is there to the last byte.
+    fn is_whole(&self, named: &[String], disk: &SimulatedDisk) -> Result<(), String> {
+        for name in named {
+            let read = disk.read(&Path::new(ROOT).join(name), None);
+            match read {
+                Ok(bytes) if bytes == self.pyramids[name] => {}
+                Ok(bytes) => return Err(format!("{name} has {} wrong bytes", bytes.len())),
+                Err(e) => return Err(format!("{name} is lost: {e}")),
+            }
+        }
+        Ok(())
+    }
+
+    async fn is_complete(
+        &self,
+        archive: &VisualizationArchive,
+        disk: &SimulatedDisk,
+    ) -> Result<(), String> {
+        let tiles = seen(archive).await.into_iter();
+        let tiles: BTreeMap<_, _> = tiles.map(|(name, tile)| (name, tile.pyramid)).collect();
+        if tiles != self.tiles {
+            return Err(format!("not all arrived: {tiles:?}"));
+        }
+        let named: Vec<_> = tiles.into_values().collect();
+        self.is_whole(&named, disk)?;
+        let left = orphans(archive).await;
+        let incoming = disk.tree();
+        let incoming: Vec<_> = incoming
+            .iter()
+            .filter(|n| n.contains(".incoming/"))
+            .collect();
+        if left.is_empty() && incoming.len() == 1 {
+            Ok(())
+        } else {
+            Err(format!("left behind: {left:?}, {incoming:?}"))
+        }
+    }
+}
+
+/// Makes hashes that are the same each time.
+const FIXED: std::hash::BuildHasherDefault<std::hash::DefaultHasher> =
+    std::hash::BuildHasherDefault::new();
+
+/// The pyramids that the catalog in a folder names.
+async fn named(folder: &Path) -> Vec<String> {
+    let catalog = Catalog::create(&folder.join("catalog.sqlite"))
+        .await
+        .unwrap();
+    let mut named = Vec::new();
+    if catalog.volume(VOLUME).await.is_ok() {
+        for z in catalog.sections(VOLUME).await.unwrap() {
+            let tiles = catalog.section_tiles(VOLUME, z).await.unwrap();
+            named.extend(tiles.into_iter().map(|tile| tile.pyramid));
+        }
+    }
+    catalog.close().await;
+    named
+}
+
+/// A small generator.
+struct Chance(u64);
+
+impl Chance {
+    fn next(&mut self) -> u64 {
+        self.0 = self
+            .0
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
+        self.0 ^ (self.0 >> 29)
+    }
+
+    fn below(&mut self, n: u64) -> u64 {
+        (self.next() >> 20) % n
+    }
+}
+
+/// A disk for storages that do not care: syncs that are not wanted are left out.
+#[derive(Debug)]
+struct Lax {
+    disk: SimulatedDisk,
+    files: bool,
+    folders: bool,
+}
+
+struct LaxFile {
+    file: Box<dyn OpenFile>,
+    syncs: bool,
+}
+
+impl OpenFile for LaxFile {
+    fn lock(&mut self) {
+        self.file.lock();
+    }
+    fn write_all(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        self.file.write_all(bytes)
+    }
+    fn sync(&mut self) -> std::io::Result<()> {
+        if self.syncs { self.file.sync() } else { Ok(()) }
+    }
+}
+
+/// A disk for a storage that gives files their names before they are whole: it renames nothing, and
+/// what was to be a temporary file lies under its own name from the first.
+#[derive(Debug)]
+struct Naming {
+    disk: SimulatedDisk,
+}
+
+macro_rules! delegate_disk {
+    ($kind:ty { $($own:item)* }) => {
+        impl Disk for $kind {
+            $($own)*
+            fn remove_file(&self, path: &Path) -> std::io::Result<()> {
+                self.disk.remove_file(path)
+            }
+            fn remove_if_unlocked(&self, path: &Path) -> std::io::Result<()> {
+                self.disk.remove_if_unlocked(path)
+            }
+            fn create_dir(&self, path: &Path) -> std::io::Result<()> {
+                self.disk.create_dir(path)
+            }
+            fn metadata(&self, path: &Path) -> std::io::Result<Metadata> {
+                self.disk.metadata(path)
+            }
+            fn read_dir(&self, path: &Path) -> std::io::Result<Vec<DirEntry>> {
+                self.disk.read_dir(path)
+            }
+            fn read(
+                &self,
+                path: &Path,
+                range: Option<std::ops::Range<u64>>,
+            ) -> std::io::Result<Bytes> {
+                self.disk.read(path, range)
+            }
+        }
+    };
+}
+
+delegate_disk!(Lax {
+    fn create_new(&self, path: &Path) -> std::io::Result<Box<dyn OpenFile>> {
+        let (file, syncs) = (self.disk.create_new(path)?, self.files);
+        Ok(Box::new(LaxFile { file, syncs }))
+    }
+    fn rename(&self, from: &Path, to: &Path) -> std::io::Result<()> {
+        self.disk.rename(from, to)
+    }
+    fn sync_dir(&self, path: &Path) -> std::io::Result<()> {
+        if self.folders { self.disk.sync_dir(path) } else { Ok(()) }
+    }
+});
+
+delegate_disk!(Naming {
+    fn create_new(&self, path: &Path) -> std::io::Result<Box<dyn OpenFile>> {
+        let (file, syncs) = (self.disk.create_new(path)?, false);
+        Ok(Box::new(LaxFile { file, syncs }))
+    }
+    fn rename(&self, from: &Path, to: &Path) -> std::io::Result<()> {
+        // The name is durable, and the content is not yet.
+        self.disk.rename(from, to)?;
+        self.disk.sync_dir(to.parent().unwrap_or(Path::new("")))
+    }
+    fn sync_dir(&self, path: &Path) -> std::io::Result<()> {
+        self.disk.sync_dir(path)
+    }
+});
+
+/// Does each write when the next one comes.
+#[derive(Debug)]
+struct Hasty {
+    inner: Arc<dyn Storage>,
+    promised: Mutex<Option<(String, Bytes)>>,
+}
+
+impl Storage for Hasty {
+    fn read<'a>(
+        &'a self,
+        name: &'a str,
+        range: Option<std::ops::Range<u64>>,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        self.inner.read(name, range)
+    }
+
+    fn write_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<(), StorageError>> {
+        let promise = (name.to_owned(), bytes);
+        let earlier = self.promised.lock().unwrap().replace(promise);
+        Box::pin(async move {
+            match earlier {
+                Some((name, bytes)) => self.inner.write_durable(&name, bytes).await,
+                None => Ok(()),
+            }
+        })
+    }
+
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+        self.inner.entries(prefix)
+    }
+
+    fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
+        self.inner.delete(name)
+    }
+
+    fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
+        self.inner.size(name)
+    }
+}

@@ -1,0 +1,5 @@
+use reqwest::Client;
+
+pub(in crate::remote) fn client() -> Client {
+    Client::new()
+}

@@ -1,0 +1,208 @@
+"""Archives in an object store, with and without faults."""
+
+import json
+import os
+import random
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+import unittest
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+sys.path.append(str(Path(__file__).parents[1] / "clients"))
+from lib.saccade import BIN, Process, until  # noqa: E402
+from store import BUCKET, Proxy, Store  # noqa: E402
+
+SEED = int(os.environ.get("SACCADE_S3_SEED", time.time_ns() % 1_000_000))
+KILLS = 8
+CAMERA = ["--size", "320x240"]
+
+
+def run(*args, **env):
+    return subprocess.run([BIN, *map(str, args)], capture_output=True, text=True, timeout=120, env={**os.environ, **env})
+
+
+class S3(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        print(f"seed {SEED}: SACCADE_S3_SEED={SEED} repeats the faults", flush=True)
+        folder = tempfile.TemporaryDirectory(prefix="saccade-s3-")
+        cls.addClassCleanup(folder.cleanup)
+        cls.work = Path(folder.name)
+        cls.store = Store()
+        cls.addClassCleanup(cls.store.close)
+        for name in [name for name in os.environ if name.startswith("AWS_")]:
+            del os.environ[name]
+        os.environ.update(AWS_ACCESS_KEY_ID="id", AWS_SECRET_ACCESS_KEY="secret", AWS_EC2_METADATA_DISABLED="true")
+        cls.acquisition = cls.work / "acquisition"
+        made = run("simulate", cls.acquisition, "--phantom", "--name", "tissue", "--extent", "601,403,20", "--voxel-nm",
+                   "8,8,40", "--tile", "256x256", "--rate", "max", "--corrections", "never", "--seed", "7")
+        assert made.returncode == 0, made.stderr
+        cls.local = cls.work / "local"
+        made = run("ingest", cls.acquisition, cls.local, "--once")
+        assert made.returncode == 0, made.stderr
+        cls.want = {str(path.relative_to(cls.local)): path.read_bytes() for path in cls.local.glob("tiles/**/*.tif")}
+        assert len(cls.want) >= 100, len(cls.want)
+
+    def setUp(self):
+        self.proxy = Proxy(self.store, SEED)
+        self.addCleanup(self.proxy.close)
+        os.environ["AWS_ENDPOINT_URL"] = self.proxy.url
+        self.prefix = self._testMethodName
+        self.catalog = self.work / f"{self.prefix}.sqlite"
+        self.archive = [f"s3://{BUCKET}/{self.prefix}", "--catalog", self.catalog]
+
+    def start(self, *args):
+        process = Process(self.work / f"{self.prefix}-{args[0]}.log", *args)
+        self.addCleanup(process.stop)
+        return process
+
+    def named(self):
+        """What the catalog names."""
+        if not self.catalog.exists():
+            return []
+        with sqlite3.connect(self.catalog) as catalog:
+            if not catalog.execute("SELECT 1 FROM sqlite_schema WHERE name = 'tiles'").fetchone():
+                return []
+            return [name for (name,) in catalog.execute("SELECT pyramid FROM tiles")]
+
+    def whole(self):
+        """Checks what the catalog names; returns how many there are."""
+        named = self.named()
+        for name in named:
+            self.assertEqual(self.store.object(self.prefix, name), self.want[name], name)
+        return len(named)
+
+    def complete(self):
+        self.assertEqual(sorted(self.named()), sorted(self.want))
+        self.whole()
+        self.assertEqual(sorted(self.store.names(self.prefix)), sorted(self.want), "objects that nobody names")
+
+    def picture(self, *archive):
+        out = self.work / f"{self.prefix}.png"
+        drawn = run("render", *archive, "-o", out, *CAMERA)
+        self.assertEqual(drawn.returncode, 0, drawn.stderr)
+        return np.asarray(Image.open(out).convert("L"), np.int16)
+
+    def test_a_bucket_serves_as_a_folder_does(self):
+        done = run("ingest", self.acquisition, *self.archive, "--once")
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertIn(f"s3://{BUCKET}/{self.prefix}", done.stderr)
+        self.complete()
+        self.assertEqual(self.proxy.requests["PUT"], len(self.want), "one request a pyramid")
+        self.proxy.requests.clear()
+        self.proxy.latency = 0.02
+        began = time.monotonic()
+        picture = self.picture(*self.archive)
+        print(f"\na picture of {len(self.want)} tiles at 20 ms: {dict(self.proxy.requests)}, {time.monotonic() - began:.1f} s")
+        here = self.picture(self.local)
+        self.assertLess(np.abs(picture - here).mean(), 0.5, "grey levels")
+        self.assertGreater(np.abs(picture - here[::-1]).mean(), 2, "the comparison shows nothing")
+        served = [self.start("serve", *archive, "--port", "0").printed(r"http://[\w.:]+")
+                  for archive in [self.archive, [self.local]]]
+        for key in chunks(served[0]):
+            there, here = [chunk(url, key) for url in served]
+            self.assertEqual(there, here, key)
+            self.assertTrue(here and any(here), key)
+
+    def test_killed_while_it_writes(self):
+        random.seed(SEED)
+        self.proxy.latency = 0.02
+        undone = 0
+        for _ in range(KILLS):
+            before = len(self.named())
+            ingest = self.start("ingest", self.acquisition, *self.archive)
+            more = random.randrange(1, 12)
+            until("some tiles", lambda: len(self.named()) >= min(before + more, len(self.want)))
+            ingest.child.kill()
+            ingest.child.wait()
+            undone += self.whole() < len(self.want)
+        self.assertGreater(undone, KILLS / 2, "kills found nothing undone")
+        self.proxy.latency = 0
+        done = run("ingest", self.acquisition, *self.archive, "--once")
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.complete()
+
+    def test_faults(self):
+        os.environ["AWS_TIMEOUT"] = "1s"
+        self.addCleanup(os.environ.pop, "AWS_TIMEOUT")
+        # Without faults first, so that there is something to serve.
+        ingest = self.start("ingest", self.acquisition, *self.archive, "--workers", "4")
+        until("a few tiles", lambda: len(self.named()) > 10)
+        # Everything fails: it waits and says why.
+        self.proxy.faults = {"busy": 1}
+        ingest.printed("object store")
+        ingest.printed("503")
+        waiting = len(self.named())
+        time.sleep(1)
+        self.assertEqual(len(self.named()), waiting, "the store refuses everything")
+        self.assertTrue(ingest.running())
+        # Much fails: it goes on.
+        self.proxy.faults = dict(zip(Proxy.FAULTS, [0.1, 0.1, 0.1, 0.05, 0.02]))
+        served = [self.start("serve", *archive, "--port", "0").printed(r"http://[\w.:]+")
+                  for archive in [self.archive, [self.local]]]
+        failed = same = 0
+        ends = time.monotonic() + 60
+        while len(self.named()) < len(self.want) or same < 40:
+            self.assertLess(time.monotonic(), ends, f"{len(self.named())} of {len(self.want)}, {same} chunks")
+            complete = len(self.named()) == len(self.want)
+            for key in chunks(served[0]):
+                got, want = [chunk(url, key) for url in served]
+                failed += got is None
+                if complete and got is not None:
+                    # Also what was read before, with faults, and remembered.
+                    self.assertEqual(got, want)
+                    same += 1
+        for fault in Proxy.FAULTS:
+            self.assertGreater(self.proxy.done[fault], 0, f"{fault} never happened")
+        print(f"\n{dict(self.proxy.done)} among {sum(self.proxy.requests.values())} requests, {failed} chunks failed")
+        self.proxy.faults = {}
+        ingest.printed("is written now")
+        ingest.stop()
+        self.complete()
+
+    def test_what_cannot_work_says_how_to_mend_it(self):
+        here = self.work / "none.sqlite"
+        for faults, args, env, said in [
+            ({}, [f"s3://{BUCKET}/x"], {}, "--catalog"),
+            ({}, ["s3://nobody/x", "--catalog", here], {}, "no such bucket"),
+            ({"denied": 1}, [f"s3://{BUCKET}/x", "--catalog", here], {}, "AWS_SECRET_ACCESS_KEY"),
+            ({}, [f"s3://{BUCKET}/x", "--catalog", here], {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "network"),
+            ({}, [f"s3://{BUCKET}/x", "--catalog", here], {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}, "no credentials"),
+            ({}, ["s3:/x", "--catalog", here], {}, "s3://bucket"),
+            ({}, ["gs://x/y", "--catalog", here], {}, "s3://bucket"),
+        ]:
+            self.proxy.faults = faults
+            done = run("ingest", self.acquisition, *args, "--once", **env)
+            self.assertNotEqual(done.returncode, 0, args)
+            self.assertIn(said, done.stderr)
+            self.assertNotIn("panicked", done.stderr)
+            self.assertFalse(here.exists(), "a catalog was left behind")
+
+
+def chunks(url):
+    """Keys of the chunks of level 0 along a diagonal."""
+    with urllib.request.urlopen(f"{url}/v/tissue/volume.json", timeout=60) as answer:
+        volume = json.load(answer)["volume"]
+    counts = [-(-voxels // edge) for voxels, edge in zip(volume["levels"][0]["extent"], volume["chunk"])]
+    return [f"0/c/0/{n % counts[2]}/{n % counts[1]}/{n % counts[0]}" for n in range(max(counts))]
+
+
+def chunk(url, key):
+    """A chunk's bytes, empty if nothing was acquired there, None if it failed."""
+    try:
+        with urllib.request.urlopen(f"{url}/v/tissue/zarr/{key}", timeout=60) as answer:
+            return answer.read()
+    except urllib.error.HTTPError as error:
+        return b"" if error.code == 404 else None
+
+
+if __name__ == "__main__":
+    unittest.main(verbosity=2)

@@ -1,0 +1,159 @@
+"""An S3 server on loopback, and what stands between it and its clients: a proxy that loses, delays and refuses."""
+
+import http.client
+import http.server
+import logging
+import random
+import socket
+import struct
+import threading
+import time
+from collections import Counter
+
+from moto.server import ThreadedMotoServer
+
+BUCKET = "lab"
+
+
+class Store:
+    """moto's server, which wants requests signed, but checks no signature."""
+
+    SIGNED = {"Authorization": "AWS4-HMAC-SHA256 Credential=id/20260101/us-east-1/s3/aws4_request, "
+                               "SignedHeaders=host, Signature=0"}
+
+    def __init__(self):
+        logging.getLogger("werkzeug").setLevel(logging.ERROR)
+        self.server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+        self.server.start()
+        self.host, self.port = self.server.get_host_and_port()
+        self.request("PUT", f"/{BUCKET}")
+
+    def request(self, method, path, body=None):
+        connection = http.client.HTTPConnection(self.host, self.port, timeout=20)
+        connection.request(method, path, body, self.SIGNED)
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+
+    def names(self, prefix):
+        """Of the objects below a prefix, without it."""
+        from xml.etree import ElementTree
+
+        names, more = [], ""
+        while True:
+            _, page = self.request("GET", f"/{BUCKET}?list-type=2&prefix={prefix}/{more}")
+            page = ElementTree.fromstring(page)
+            space = page.tag.removesuffix("ListBucketResult")
+            names += [key.text.removeprefix(prefix + "/") for key in page.iter(space + "Key")]
+            token = page.find(space + "NextContinuationToken")
+            if token is None:
+                return names
+            more = f"&continuation-token={token.text}"
+
+    def object(self, prefix, name):
+        status, body = self.request("GET", f"/{BUCKET}/{prefix}/{name}")
+        return body if status == 200 else None
+
+    def close(self):
+        self.server.stop()
+
+
+class Proxy:
+    """Forwards requests to the store, or does one of FAULTS to them."""
+
+    FAULTS = ["busy", "reset", "lost", "cut", "drip"]
+
+    def __init__(self, store, seed):
+        self.random = random.Random(seed)
+        self.lock = threading.Lock()
+        self.faults = {}
+        self.requests = Counter()
+        self.done = Counter()
+        self.latency = 0
+        proxy = self
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def handle_any(self):
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                fault = proxy.next_fault(self.command)
+                time.sleep(proxy.latency)
+                if fault == "busy":
+                    return self.answer(503, [], b"<Error><Code>SlowDown</Code></Error>")
+                if fault == "denied":
+                    return self.answer(403, [], b"<Error><Code>AccessDenied</Code></Error>")
+                if fault == "reset":
+                    return self.reset()
+                connection = http.client.HTTPConnection(store.host, store.port, timeout=20)
+                headers = {k: v for k, v in self.headers.items() if k.lower() != "connection"}
+                connection.request(self.command, self.path, body, headers)
+                answer = connection.getresponse()
+                content = answer.read()
+                connection.close()
+                if fault == "lost":  # The store did it; nobody hears of it.
+                    return self.reset()
+                keep = [(k, v) for k, v in answer.getheaders()
+                        if k.lower() not in ("connection", "transfer-encoding", "content-length")]
+                if self.command == "HEAD":
+                    keep.append(("Content-Length", answer.getheader("Content-Length", "0")))
+                self.answer(answer.status, keep, content, fault)
+
+            do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = handle_any
+
+            def answer(self, status, headers, content, fault=None):
+                self.send_response_only(status)
+                for name, value in headers:
+                    self.send_header(name, value)
+                if self.command != "HEAD":
+                    self.send_header("Content-Length", str(len(content)))
+                self.end_headers()
+                if self.command == "HEAD":
+                    return
+                if fault == "cut":
+                    self.wfile.write(content[: len(content) // 2])
+                    self.reset()
+                elif fault == "drip":
+                    try:
+                        for at in range(len(content)):
+                            self.wfile.write(content[at : at + 1])
+                            self.wfile.flush()
+                            time.sleep(0.2)
+                    except OSError:
+                        pass  # The client had enough.
+                    self.close_connection = True
+                else:
+                    self.wfile.write(content)
+
+            def reset(self):
+                self.wfile.flush()
+                self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                self.connection.close()
+                self.close_connection = True
+
+            def log_message(self, *_):
+                pass
+
+        class Server(http.server.ThreadingHTTPServer):
+            daemon_threads = True
+
+            def handle_error(self, *_):
+                pass  # Connections that were reset.
+
+        self.server = Server(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_port}"
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    def next_fault(self, method):
+        with self.lock:
+            self.requests[method] += 1
+            drawn = self.random.random()
+            for fault, share in self.faults.items():
+                drawn -= share
+                if drawn < 0:
+                    self.done[fault] += 1
+                    return fault
+            return None
+
+    def close(self):
+        self.server.shutdown()
+        self.server.server_close()
