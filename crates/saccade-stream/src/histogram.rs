@@ -25,21 +25,24 @@ const COUNTED_EXTENT: u32 = 512;
 const CONCURRENT: usize = 4;
 
 /// Values counted in a part of a volume.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sample {
-    /// Counts of the values of channel 0.
+    /// Counts of the values of the channel.
     pub histogram: Histogram,
     /// Whether a chunk that should be in it could not be read yet, but may be later.
     pub partial: bool,
 }
 
-/// Counts values where the coarsest level has data, in a few chunks of a level of medium
+/// Counts a channel's values where the coarsest level has data, in a few chunks of a level of medium
 /// resolution. Depends on nothing but the voxels: the same volume gives the same sample.
 ///
 /// Reads that fail for a passing reason are repeated a few times, as `retry` says.
-pub async fn sample(source: &dyn VolumeSource, retry: Retry) -> Sample {
+pub async fn sample(source: &dyn VolumeSource, channel: u32, retry: Retry) -> Sample {
     let volume = source.volume();
-    let mut result = Sample::default();
+    let mut result = Sample {
+        histogram: Histogram::new(volume.dtype),
+        partial: false,
+    };
     let Some((coarsest, counted)) = levels(volume) else {
         return result;
     };
@@ -51,7 +54,7 @@ pub async fn sample(source: &dyn VolumeSource, retry: Retry) -> Sample {
             break;
         }
         let all: BTreeSet<Ordered> = chunks.iter().map(|chunk| ordered(level, chunk)).collect();
-        let chosen = spread(&all, COARSE_CHUNKS);
+        let chosen = spread(channel, &all, COARSE_CHUNKS);
         let (read, failed) = read(source, retry, chosen, &mut result.partial).await;
         for (id, chunk) in read {
             places.extend(places_with_data(volume, id, &chunk, counted));
@@ -60,7 +63,7 @@ pub async fn sample(source: &dyn VolumeSource, retry: Retry) -> Sample {
             break;
         }
     }
-    let chosen = spread(&places, COUNTED_CHUNKS);
+    let chosen = spread(channel, &places, COUNTED_CHUNKS);
     let (read, _) = read(source, retry, chosen, &mut result.partial).await;
     for (id, chunk) in read {
         count(volume, id, &chunk, &mut result.histogram);
@@ -84,11 +87,11 @@ fn ordered(level: u32, chunk: glam::UVec3) -> Ordered {
 }
 
 /// At most `count` of them, at even distances.
-fn spread(chunks: &BTreeSet<Ordered>, count: usize) -> Vec<ChunkId> {
+fn spread(channel: u32, chunks: &BTreeSet<Ordered>, count: usize) -> Vec<ChunkId> {
     let step = chunks.len().div_ceil(count).max(1);
     let chosen = chunks.iter().skip(step / 2).step_by(step);
     let id = |&(level, [z, y, x]): &Ordered| ChunkId {
-        channel: 0,
+        channel,
         level,
         chunk: [x, y, z].into(),
     };
@@ -142,7 +145,7 @@ async fn read(
     (chunks, failed)
 }
 
-/// Rows of the chunk's voxels inside of the volume, with the first voxel of each.
+/// Rows of the chunk's voxels inside of the volume, with the first voxel of each \[bytes\].
 fn rows<'c>(
     volume: &'c Volume,
     id: ChunkId,
@@ -151,10 +154,11 @@ fn rows<'c>(
     let inside = id.voxels(volume).unwrap_or(VoxelBox::EMPTY);
     let [width, height, _] = volume.chunk.to_array().map(|edge| edge as usize);
     let size = inside.size();
+    let bytes = volume.dtype.bytes();
     let starts = (0..size.z).flat_map(move |z| (0..size.y).map(move |y| (y, z)));
     starts.filter_map(move |(y, z)| {
-        let from = (z as usize * height + y as usize) * width;
-        let row = chunk.get(from..from + size.x as usize)?;
+        let from = (z as usize * height + y as usize) * width * bytes;
+        let row = chunk.get(from..from + size.x as usize * bytes)?;
         Some((inside.min + glam::UVec3::new(0, y, z), row))
     })
 }
@@ -167,7 +171,11 @@ fn places_with_data(volume: &Volume, id: ChunkId, chunk: &[u8], level: u32) -> B
     );
     let mut places = BTreeSet::new();
     for (start, row) in rows(volume, id, chunk) {
-        for (x, _) in (start.x..).zip(row).filter(|(_, value)| **value != 0) {
+        let voxels = row.chunks(volume.dtype.bytes());
+        let measured = (start.x..)
+            .zip(voxels)
+            .filter(|(_, voxel)| **voxel != [0, 0][..voxel.len()]);
+        for (x, _) in measured {
             let at = glam::UVec3::new(x, start.y, start.z);
             let level0 = coarse.voxels_from_box(VoxelBox::new(at, at + 1));
             let voxels = fine.box_from_voxels(level0);
@@ -218,7 +226,7 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_time()
             .build();
-        runtime.unwrap().block_on(sample(source, retry))
+        runtime.unwrap().block_on(sample(source, 0, retry))
     }
 
     #[test]
@@ -248,7 +256,7 @@ mod tests {
 
     #[test]
     fn nothing_acquired_gives_an_empty_histogram() {
-        assert_eq!(take(&source(UVec3::splat(40), |_| 0)), Sample::default());
+        assert_eq!(take(&source(UVec3::splat(40), |_| 0)).histogram.total(), 0);
     }
 
     #[test]
@@ -262,7 +270,7 @@ mod tests {
             .unwrap();
         let fresh = source(UVec3::new(90, 80, 70), value);
         assert_eq!(take(&grown), take(&fresh));
-        assert_ne!(take(&fresh), Sample::default());
+        assert!(take(&fresh).histogram.total() > 0);
     }
 
     /// Is not ready for the first reads of the counted level.

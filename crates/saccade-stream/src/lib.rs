@@ -35,6 +35,7 @@
 //! It knows neither where voxels come from nor what is drawn.
 
 pub mod brick;
+mod channels;
 mod clock;
 mod histogram;
 mod host_cache;
@@ -45,6 +46,7 @@ mod session;
 #[cfg(not(target_family = "wasm"))]
 mod settle;
 
+pub use channels::Channel;
 pub use histogram::{Sample, sample};
 pub use session::{Again, Session, SessionError, SessionOptions, Status, Wake};
 #[cfg(not(target_family = "wasm"))]

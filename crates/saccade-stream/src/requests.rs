@@ -22,9 +22,10 @@ pub(crate) enum Event {
         answer: Result<Chunk, ChunkError>,
     },
     Change(Change),
+    /// Values of some channels were counted.
     Sample {
         number: u64,
-        sample: Box<Sample>,
+        samples: Vec<(u32, Sample)>,
     },
 }
 
@@ -109,14 +110,17 @@ impl Requests {
         self.source.value_range(id)
     }
 
-    /// Starts counting values; an earlier count that has not ended is dropped.
-    pub(crate) fn sample(&mut self, retry: Retry) {
+    /// Starts counting values of channels; an earlier count that has not ended is dropped.
+    pub(crate) fn sample(&mut self, channels: Vec<u32>, retry: Retry) {
         let (source, to, wake) = (self.source.clone(), self.sender.clone(), self.wake.clone());
         self.samples += 1;
         let number = self.samples;
         let handle = spawn_abortable(async move {
-            let sample = Box::new(sample(&*source, retry).await);
-            drop(to.send(Event::Sample { number, sample }));
+            let mut samples = Vec::with_capacity(channels.len());
+            for channel in channels {
+                samples.push((channel, sample(&*source, channel, retry).await));
+            }
+            drop(to.send(Event::Sample { number, samples }));
             wake();
         });
         if let Some((_, earlier)) = self.sample.replace((number, handle)) {

@@ -7,17 +7,19 @@ use std::time::Duration;
 
 use glam::UVec2;
 use saccade_core::brick::BrickId;
-use saccade_core::transfer::{Histogram, TransferFunction};
+use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::Volume;
 use saccade_render::wgpu::DeviceType;
 use saccade_render::{
-    Delivery, Fidelity, FrameReport, Gpu, MemoryUse, Renderer, RendererError, RendererOptions,
-    Statistics, View,
+    ChannelError, ChannelView, Delivery, Fidelity, FrameReport, Gpu, MemoryUse, Renderer,
+    RendererError, RendererOptions, Statistics, View,
 };
 use saccade_source::VolumeSource;
 
 use crate::brick::range_of;
+use crate::channels::{self, Channel};
 use crate::clock::Clock;
+use crate::histogram::Sample;
 use crate::policy::{Limits, Pace, Refresh, Retry};
 use crate::pull::{Freshness, Progress, Pull};
 use crate::requests::{Event, Requests};
@@ -80,6 +82,13 @@ pub enum SessionError {
         /// The volume's name.
         name: String,
     },
+    /// Its channels cannot be shown.
+    #[error("the volume's channels cannot be shown")]
+    Channels {
+        /// Why.
+        #[from]
+        source: ChannelError,
+    },
 }
 
 /// When to call [`Session::frame`] again, if nobody wakes the caller before.
@@ -138,9 +147,9 @@ pub struct Session {
     requests: Requests,
     clock: Clock,
     refresh: Refresh,
-    histogram: Histogram,
-    transfer: TransferFunction,
-    transfer_is_automatic: bool,
+    channels: Vec<Channel>,
+    /// As the renderer has them.
+    views: Vec<ChannelView>,
     frames_in_flight: usize,
     retry: Retry,
     /// Bricks whose bounds the renderer was told since they last changed.
@@ -191,29 +200,25 @@ impl Session {
             bands: if software { 4 } else { 1 },
             ..RendererOptions::default()
         };
-        let mut renderer =
-            Renderer::new(gpu, volume.clone(), renderer_options).map_err(|source| {
-                SessionError::Renderer {
-                    source,
-                    name: volume.name.clone(),
-                }
-            })?;
+        let renderer = Renderer::new(gpu, volume.clone(), renderer_options).map_err(|source| {
+            SessionError::Renderer {
+                source,
+                name: volume.name.clone(),
+            }
+        })?;
         let requests = Requests::new(source.clone(), options.wake);
         // Asked after listening began: no change is lost between the two.
         let revision = source.revision();
-        let histogram = Histogram::default();
-        let transfer = histogram.transfer_function(volume.size_nm());
-        renderer.set_transfer_function(&transfer);
-        Ok(Self {
+        let channels = channels::of_volume(&volume);
+        let mut session = Self {
             renderer,
             retry: options.limits.retry,
             pull: Pull::new(volume, options.limits),
             requests,
             clock: Clock::start(),
             refresh: Refresh::new(),
-            histogram,
-            transfer,
-            transfer_is_automatic: true,
+            channels,
+            views: Vec::new(),
             frames_in_flight: options.frames_in_flight.max(1),
             told: HashSet::new(),
             pending: VecDeque::new(),
@@ -225,7 +230,9 @@ impl Session {
             frame_time: None,
             frame_size: UVec2::ZERO,
             known_at: None,
-        })
+        };
+        session.put_channels()?;
+        Ok(session)
     }
 
     /// The volume shown.
@@ -238,45 +245,95 @@ impl Session {
         &self.renderer
     }
 
-    /// Values of the volume, as far as a few chunks tell. Follows changes.
-    pub fn histogram(&self) -> &Histogram {
-        &self.histogram
+    /// How each channel of the volume is shown.
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
     }
 
-    /// Colours and opacities in force.
-    pub fn transfer_function(&self) -> &TransferFunction {
-        &self.transfer
+    /// Shows or hides a channel.
+    ///
+    /// # Errors
+    ///
+    /// [`ChannelError`] for a channel that the volume does not have, and when too many would be seen.
+    pub fn set_visible(&mut self, channel: u32, visible: bool) -> Result<(), ChannelError> {
+        let before = self.channel_mut(channel)?.visible;
+        self.channel_mut(channel)?.visible = visible;
+        if let Err(error) = self.put_channels() {
+            self.channel_mut(channel)?.visible = before;
+            return Err(error);
+        }
+        if visible && !before {
+            // Nobody may have counted its values.
+            self.refresh.changed();
+        }
+        self.is_awaited();
+        Ok(())
     }
 
-    /// Whether they follow the histogram.
-    pub fn is_transfer_function_automatic(&self) -> bool {
-        self.transfer_is_automatic
+    /// Sets a channel's colours and opacities; they no longer follow the histogram.
+    ///
+    /// # Errors
+    ///
+    /// [`ChannelError::NoSuchChannel`].
+    pub fn set_transfer_function(
+        &mut self,
+        channel: u32,
+        transfer: TransferFunction,
+    ) -> Result<(), ChannelError> {
+        let of = self.channel_mut(channel)?;
+        (of.transfer, of.automatic) = (transfer, false);
+        self.put_channels()?;
+        self.is_awaited();
+        Ok(())
     }
 
-    /// Sets colours and opacities; they no longer follow the histogram.
-    pub fn set_transfer_function(&mut self, transfer: TransferFunction) {
-        self.transfer_is_automatic = false;
-        self.put_transfer_function(transfer);
-        // Somebody waits for it, as for another view.
+    /// Sets the value of a channel's surface, `[0, 1]`, for where surfaces are drawn; `None` lets it follow the
+    /// opacities.
+    ///
+    /// # Errors
+    ///
+    /// [`ChannelError::NoSuchChannel`].
+    pub fn set_iso(&mut self, channel: u32, iso: Option<f32>) -> Result<(), ChannelError> {
+        self.channel_mut(channel)?.iso = iso;
+        self.put_channels()?;
+        self.is_awaited();
+        Ok(())
+    }
+
+    /// Lets a channel's colours and opacities follow the histogram, as they do at first.
+    ///
+    /// # Errors
+    ///
+    /// [`ChannelError::NoSuchChannel`].
+    pub fn set_automatic_transfer_function(&mut self, channel: u32) -> Result<(), ChannelError> {
+        let volume = self.volume().clone();
+        let of = self.channel_mut(channel)?;
+        of.follow_histogram(&volume, channel as usize);
+        self.put_channels()
+    }
+
+    fn channel_mut(&mut self, channel: u32) -> Result<&mut Channel, ChannelError> {
+        let channels = u32::try_from(self.channels.len()).unwrap_or(u32::MAX);
+        let of = self.channels.get_mut(channel as usize);
+        of.ok_or(ChannelError::NoSuchChannel { channel, channels })
+    }
+
+    /// Somebody waits for the picture, as for another view.
+    fn is_awaited(&mut self) {
         self.drawn_view = None;
     }
 
-    /// Lets colours and opacities follow the histogram, as they do at first.
-    pub fn set_automatic_transfer_function(&mut self) {
-        self.transfer_is_automatic = true;
-        self.put_transfer_function(self.histogram.transfer_function(self.volume().size_nm()));
-    }
-
-    fn put_transfer_function(&mut self, transfer: TransferFunction) {
-        if self.transfer != transfer {
-            // The renderer forgets what it knows when values are stored the other way round.
-            if self.transfer.polarity != transfer.polarity {
-                self.told.clear();
-            }
-            self.renderer.set_transfer_function(&transfer);
-            self.transfer = transfer;
+    /// Tells the renderer how channels are shown, if that changed.
+    fn put_channels(&mut self) -> Result<(), ChannelError> {
+        let views = channels::views(&self.channels);
+        if self.views != views {
+            self.renderer.set_channels(&views)?;
+            self.views = views;
+            // What was hidden may be seen, and the renderer may have forgotten what it knew.
+            self.told.clear();
             self.dirty = true;
         }
+        Ok(())
     }
 
     /// Takes what arrived, asks for what is missing, draws if the picture would change.
@@ -299,7 +356,8 @@ impl Session {
             self.take_report(report, now);
         }
         if self.refresh.starts(now) {
-            self.requests.sample(self.retry);
+            let seen = self.views.iter().map(|view| view.channel);
+            self.requests.sample(seen.collect(), self.retry);
         }
         self.requests.apply(self.pull.plan(now));
         let cut = self.deliver();
@@ -356,16 +414,26 @@ impl Session {
                     self.refresh.changed();
                     self.dirty = true;
                 }
-                Event::Sample { sample, .. } => {
-                    if sample.partial {
-                        self.refresh.changed();
-                    }
-                    self.histogram = sample.histogram;
-                    if self.transfer_is_automatic {
-                        self.set_automatic_transfer_function();
-                    }
+                Event::Sample { samples, .. } => self.take_samples(samples),
+            }
+        }
+    }
+
+    fn take_samples(&mut self, samples: Vec<(u32, Sample)>) {
+        let volume = self.volume().clone();
+        for (channel, sample) in samples {
+            if sample.partial {
+                self.refresh.changed();
+            }
+            if let Ok(of) = self.channel_mut(channel) {
+                of.histogram = sample.histogram;
+                if of.automatic {
+                    of.follow_histogram(&volume, channel as usize);
                 }
             }
+        }
+        if let Err(error) = self.put_channels() {
+            log::error!("channels were refused: {error}");
         }
     }
 

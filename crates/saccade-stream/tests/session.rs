@@ -137,8 +137,8 @@ async fn a_volume_is_seen_and_then_nothing_is_drawn() {
     let view = view(&*source);
     let mut session = Session::new(&gpu, source, options()).unwrap();
     let image = picture(&mut session, &view).await;
-    assert!(session.is_transfer_function_automatic());
-    assert!(session.histogram().total() > 0);
+    assert!(session.channels()[0].automatic);
+    assert!(session.channels()[0].histogram.total() > 0);
     let lit = image.rgba.chunks(4).filter(|p| p[0] > 30).count();
     assert!(lit > 200, "{lit} pixels show blobs");
 
@@ -292,11 +292,11 @@ async fn the_users_transfer_function_stays() {
     let size = session.volume().size_nm();
     let chosen: TransferFunction =
         saccade_core::transfer::Histogram::default().transfer_function(size);
-    session.set_transfer_function(chosen.clone());
+    session.set_transfer_function(0, chosen.clone()).unwrap();
     let other = picture(&mut session, &view).await;
     assert_ne!(other, automatic);
-    assert_eq!(session.transfer_function(), &chosen);
-    session.set_automatic_transfer_function();
+    assert_eq!(&session.channels()[0].transfer, &chosen);
+    session.set_automatic_transfer_function(0).unwrap();
     assert!(picture(&mut session, &view).await == automatic);
 }
 
@@ -363,7 +363,7 @@ async fn what_a_source_knows_to_be_hidden_is_not_read() {
             ..view(&*source)
         };
         let mut session = Session::new(&gpu, source.clone(), options()).unwrap();
-        session.set_transfer_function(transfer.clone());
+        session.set_transfer_function(0, transfer.clone()).unwrap();
         let image = picture(&mut session, &view).await;
         seen.push((image, source.reads.load(Ordering::Relaxed)));
     }
@@ -384,4 +384,97 @@ async fn what_a_source_knows_to_be_hidden_is_not_read() {
         few * 2 < *many,
         "{few} chunks were read, and {many} without ranges"
     );
+}
+
+/// Three channels of 16 bit, each an array of its own; counts reads per channel.
+struct Stained {
+    volume: Arc<Volume>,
+    channels: [ArraySource; 3],
+    reads: [AtomicU64; 3],
+}
+
+impl Stained {
+    fn new() -> Self {
+        let channel = |shift: u32| {
+            let volume = source().volume().as_ref().clone();
+            let shifted = |at: UVec3| value(at + UVec3::new(shift * 8, shift * 3, 0));
+            let voxels = VoxelBox::of_size(EXTENT).iter().map(shifted).collect();
+            ArraySource::new(volume, voxels).unwrap()
+        };
+        let channels = [channel(0), channel(1), channel(2)];
+        let volume = Volume {
+            dtype: saccade_core::volume::Dtype::Uint16,
+            channels: ["nuclei", "actin", "tubulin"].map(str::to_owned).to_vec(),
+            ..channels[0].volume().as_ref().clone()
+        };
+        Self {
+            volume: Arc::new(volume),
+            channels,
+            reads: Default::default(),
+        }
+    }
+
+    fn reads(&self) -> [u64; 3] {
+        [0, 1, 2].map(|c: usize| self.reads[c].load(Ordering::Relaxed))
+    }
+}
+
+impl VolumeSource for Stained {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.volume
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        let channel = id.channel as usize;
+        self.reads[channel].fetch_add(1, Ordering::Relaxed);
+        Box::pin(async move {
+            let of_one = ChunkId { channel: 0, ..id };
+            Ok(match self.channels[channel].read(of_one).await? {
+                // Twelve bits.
+                Chunk::Voxels(voxels) => {
+                    let deep = voxels
+                        .iter()
+                        .flat_map(|&v| (u16::from(v) * 16).to_le_bytes());
+                    Chunk::Voxels(deep.collect())
+                }
+                Chunk::Empty => Chunk::Empty,
+            })
+        })
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.channels[0].changes()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn channels_are_read_when_they_are_seen() {
+    let Some(gpu) = test_gpu().await else { return };
+    let source = Arc::new(Stained::new());
+    let view = view(&*source);
+    let mut session = Session::new(&gpu, source.clone(), options()).unwrap();
+    session.set_visible(1, false).unwrap();
+    session.set_visible(2, false).unwrap();
+    let first = picture(&mut session, &view).await;
+    let [seen, hidden @ ..] = source.reads();
+    assert!(seen > 0 && hidden == [0, 0], "{:?}", source.reads());
+    // Twelve bits, and as bright as if they were all.
+    assert_eq!(session.channels()[0].histogram.significant_bits(), 12);
+    assert!(first.rgba.chunks(4).any(|p| p[1] > 60), "green is seen");
+    assert!(
+        first.rgba.chunks(4).all(|p| p[0] == 0 && p[2] == 0),
+        "nothing else is"
+    );
+
+    session.set_visible(1, true).unwrap();
+    let both = picture(&mut session, &view).await;
+    assert!(both != first && both.rgba.chunks(4).any(|p| p[0] > 60));
+    assert!(source.reads()[1] > 0 && source.reads()[2] == 0);
+
+    // Back to one: nothing is read again.
+    session.set_visible(1, false).unwrap();
+    let reads = source.reads();
+    assert!(picture(&mut session, &view).await == first);
+    assert_eq!(source.reads(), reads);
+    assert!(session.set_visible(3, true).is_err());
 }

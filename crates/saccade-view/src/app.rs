@@ -7,7 +7,7 @@ use eframe::egui_wgpu::RenderState;
 use egui::{CentralPanel, Key, Panel, PointerButton, Response, Sense, Ui};
 use glam::{DVec2, dvec2};
 use saccade_core::camera::Camera;
-use saccade_render::View;
+use saccade_render::{ChannelError, View};
 use saccade_source::VolumeSource;
 use saccade_stream::{Again, Session, SessionError, SessionOptions, Status, Wake};
 use web_time::Instant;
@@ -15,7 +15,7 @@ use web_time::Instant;
 use crate::acquisition::{Acquisition, AcquisitionReader};
 use crate::facts::{Facts, PageStatus, line};
 use crate::navigate::{Input, moved};
-use crate::options::ViewOptions;
+use crate::options::{ViewOptions, show_channels};
 use crate::panel::{self, Settings};
 use crate::picture::{Picture, Place};
 use crate::quality::{Cost, Events, Quality};
@@ -67,6 +67,9 @@ pub(crate) enum StartError {
     /// The volume cannot be shown.
     #[error(transparent)]
     Session(#[from] SessionError),
+    /// The channels asked for cannot be shown.
+    #[error(transparent)]
+    Channels(#[from] ChannelError),
 }
 
 impl App {
@@ -93,9 +96,7 @@ impl App {
         };
         let home = Camera::around(source.volume());
         let mut session = Session::new(&gpu, source, session_options)?;
-        if let Some(transfer) = options.transfer {
-            session.set_transfer_function(transfer);
-        }
+        show_channels(&mut session, options.channels.as_deref(), options.transfer)?;
         Ok(Self {
             session,
             state,
@@ -108,6 +109,11 @@ impl App {
                 substitute: true,
                 false_colors: false,
                 background: options.background,
+                shown: options.shown,
+                selected: options
+                    .channels
+                    .and_then(|c| c.first().copied())
+                    .unwrap_or(0),
             },
             editor: TransferEditor::default(),
             panel_open: true,
@@ -188,6 +194,8 @@ impl App {
             substitute: self.settings.substitute,
             false_colors: self.settings.false_colors,
             background: self.settings.background,
+            mode: self.settings.shown.drawn_mode(),
+            clip: self.settings.shown.clip(self.session.volume()),
             ..View::new(self.camera, place.scaled(scale))
         };
         let status = self.session.frame(&view);
@@ -226,8 +234,8 @@ impl App {
             acquisition: self.acquisition.status(),
         };
         let volume = &self.session.volume().name;
-        let transfer = self.session.transfer_function();
-        let page = PageStatus::new(&facts, volume, &view.camera, view.size, transfer);
+        let channels = self.session.channels();
+        let page = PageStatus::new(&facts, volume, &view.camera, view.size, channels);
         match serde_json::to_string(&page) {
             Ok(json) => (self.publish)(json),
             Err(error) => log::error!("no status: {error}"),

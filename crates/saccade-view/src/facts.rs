@@ -3,7 +3,7 @@
 use saccade_core::camera::Camera;
 use saccade_core::transfer::TransferFunction;
 use saccade_source::remote::Status as Acquisition;
-use saccade_stream::Status;
+use saccade_stream::{Channel, Status};
 use serde::Serialize;
 
 /// What is known about the picture on the screen.
@@ -193,8 +193,10 @@ pub(crate) struct PageStatus<'a> {
     pub(crate) camera: String,
     /// Of the picture \[pixels\].
     pub(crate) size: [u32; 2],
-    /// As `?transfer=` takes it.
-    pub(crate) transfer: &'a TransferFunction,
+    /// Of the first channel that is seen, as `?transfer=` takes it.
+    pub(crate) transfer: Option<&'a TransferFunction>,
+    /// Those that are seen, as `?channels=` takes them.
+    pub(crate) channels: Vec<u32>,
     /// Requests in flight.
     pub(crate) requests: usize,
     /// The newest failure, in words.
@@ -209,9 +211,10 @@ impl<'a> PageStatus<'a> {
         volume: &'a str,
         camera: &Camera,
         size: glam::UVec2,
-        transfer: &'a TransferFunction,
+        channels: &'a [Channel],
     ) -> Self {
         let status = facts.status;
+        let seen = || (0..).zip(channels).filter(|(_, channel)| channel.visible);
         Self {
             volume,
             revision: status.revision,
@@ -226,7 +229,8 @@ impl<'a> PageStatus<'a> {
             frame_ms: status.frame_time.map(|time| time.as_secs_f64() * 1e3),
             camera: camera.to_string(),
             size: size.to_array(),
-            transfer,
+            transfer: seen().next().map(|(_, channel)| &channel.transfer),
+            channels: seen().map(|(index, _)| index).collect(),
             requests: status.progress.in_flight,
             failure: status.progress.failure.as_deref(),
             tiles: facts.acquisition.and_then(|a| a.tiles),
@@ -392,9 +396,26 @@ mod tests {
         };
         let size = glam::DVec3::splat(100.0);
         let transfer = saccade_core::transfer::Histogram::default().transfer_function(size);
+        let hidden = Channel {
+            name: "other".to_owned(),
+            visible: false,
+            histogram: Default::default(),
+            transfer: TransferFunction {
+                window: [0.1, 0.2],
+                ..transfer.clone()
+            },
+            automatic: true,
+            iso: None,
+        };
+        let seen = Channel {
+            visible: true,
+            transfer: transfer.clone(),
+            ..hidden.clone()
+        };
+        let channels = [hidden, seen];
         let volume = saccade_core::volume::Volume::new("v", glam::UVec3::ONE, size).unwrap();
         let camera = Camera::around(&volume);
-        let page = PageStatus::new(&facts, "v", &camera, glam::UVec2::new(4, 3), &transfer);
+        let page = PageStatus::new(&facts, "v", &camera, glam::UVec2::new(4, 3), &channels);
         let json = serde_json::to_value(&page).unwrap();
         assert_eq!(json["fidelity"], "complete");
         assert_eq!(json["revision"], 14);
@@ -405,5 +426,6 @@ mod tests {
         );
         let back: TransferFunction = serde_json::from_value(json["transfer"].clone()).unwrap();
         assert_eq!(back, transfer);
+        assert_eq!(json["channels"], serde_json::json!([1]));
     }
 }

@@ -16,7 +16,7 @@
 //!   bounded, and while the hand moves they get smaller on slow machines.
 //! - Where nothing changes, nothing is drawn.
 //! - Without user interface (`ui: false`), the picture equals that of a headless session with the
-//!   same camera, size and transfer function, pixel by pixel.
+//!   same camera, size, channels and transfer function, pixel by pixel.
 //!
 //! # Failure
 //!
@@ -38,6 +38,7 @@ mod panel;
 mod picture;
 mod quality;
 mod setup;
+mod shown;
 mod transfer_editor;
 
 #[cfg(not(target_family = "wasm"))]
@@ -46,8 +47,11 @@ mod native;
 mod web;
 
 pub use acquisition::AcquisitionReader;
-pub use options::{BackgroundError, ViewOptions, background_from_text};
+pub use options::{BackgroundError, ViewOptions, background_from_text, show_channels};
 pub use page::{PageError, PageOptions};
+pub use shown::{
+    Shown, ShownError, Slice, box_from_text, channels_from_text, mode_from_text, slice_from_text,
+};
 
 #[cfg(not(target_family = "wasm"))]
 pub use native::{SourceSpec, ViewError, run};

@@ -2,15 +2,23 @@
 
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{TransferFunction, linear_from_srgb};
+use saccade_render::ChannelError;
+use saccade_stream::Session;
 use saccade_stream::policy::Limits;
+
+use crate::shown::Shown;
 
 /// What the application opens with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewOptions {
     /// From where; the whole volume from a corner otherwise.
     pub camera: Option<Camera>,
-    /// Colours and opacities; following the data otherwise.
+    /// Colours and opacities of the first channel that is seen; following the data otherwise.
     pub transfer: Option<TransferFunction>,
+    /// Channels that are seen; the first few otherwise.
+    pub channels: Option<Vec<u32>>,
+    /// Which part of the volume, and how.
+    pub shown: Shown,
     /// Behind everything, linear RGB in `[0, 1]`.
     pub background: [f32; 3],
     /// Whether there is anything but the picture.
@@ -26,12 +34,43 @@ impl Default for ViewOptions {
         Self {
             camera: None,
             transfer: None,
+            channels: None,
+            shown: Shown::default(),
             background: [0.0; 3],
             ui: true,
             gpu_bytes: 512 << 20,
             limits: Limits::default(),
         }
     }
+}
+
+/// Shows these channels of a session and no others, if any are named; the first of them with these
+/// colours and opacities, if any are.
+///
+/// # Errors
+///
+/// [`ChannelError`] for channels that the volume does not have, or too many.
+pub fn show_channels(
+    session: &mut Session,
+    channels: Option<&[u32]>,
+    transfer: Option<TransferFunction>,
+) -> Result<(), ChannelError> {
+    if let Some(channels) = channels {
+        // Hidden first: never are too many seen on the way.
+        for (index, channel) in (0..).zip(session.channels().to_vec()) {
+            if channel.visible && !channels.contains(&index) {
+                session.set_visible(index, false)?;
+            }
+        }
+        for &channel in channels {
+            session.set_visible(channel, true)?;
+        }
+    }
+    if let Some(transfer) = transfer {
+        let first = channels.and_then(|channels| channels.first());
+        session.set_transfer_function(first.copied().unwrap_or(0), transfer)?;
+    }
+    Ok(())
 }
 
 /// Text that names no colour.

@@ -4,6 +4,9 @@ use saccade_core::camera::{Camera, ParseCameraError};
 use saccade_core::transfer::TransferFunction;
 
 use crate::options::{BackgroundError, ViewOptions, background_from_text};
+use crate::shown::{
+    ShownError, box_from_text, channels_from_text, mode_from_text, slice_from_text,
+};
 
 /// What a page's address asks for.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -24,6 +27,9 @@ pub enum PageError {
     /// `background=`.
     #[error(transparent)]
     Background(#[from] BackgroundError),
+    /// `channels=`, `mode=`, `clip=` or `slice=`.
+    #[error(transparent)]
+    Shown(#[from] ShownError),
     /// `transfer=`.
     #[error("transfer= is no transfer function as JSON")]
     Transfer {
@@ -56,6 +62,10 @@ impl PageOptions {
                 "transfer" => {
                     page.view.transfer = Some(serde_json::from_str::<TransferFunction>(&value)?);
                 }
+                "channels" => page.view.channels = Some(channels_from_text(&value)?),
+                "mode" => page.view.shown.mode = mode_from_text(&value)?,
+                "clip" => page.view.shown.within = Some(box_from_text(&value)?),
+                "slice" => page.view.shown.slice = Some(slice_from_text(&value)?),
                 "background" => page.view.background = background_from_text(&value)?,
                 "ui" => page.view.ui = on_or_off(value)?,
                 _ => {}
@@ -102,6 +112,10 @@ mod tests {
             ("camera", "30,25,1000,1,2,3"),
             ("transfer", &json),
             ("background", "#ffffff"),
+            ("channels", "2,0"),
+            ("mode", "surface"),
+            ("clip", "0,0,0,9,8,7"),
+            ("slice", "x=3"),
             ("ui", "off"),
         ]);
         let PageOptions { volume, view } = page.unwrap();
@@ -109,6 +123,17 @@ mod tests {
         assert_eq!(view.camera.unwrap().distance_nm, 1000.0);
         assert_eq!(view.transfer, Some(transfer));
         assert_eq!(view.background, [1.0; 3]);
+        assert_eq!(view.channels, Some(vec![2, 0]));
+        let clip = [glam::DVec3::ZERO, glam::DVec3::new(9.0, 8.0, 7.0)];
+        let slice = crate::shown::Slice { axis: 0, at: 3.0 };
+        assert_eq!(
+            view.shown,
+            crate::shown::Shown {
+                mode: saccade_render::Mode::IsoSurface,
+                within: Some(clip),
+                slice: Some(slice),
+            }
+        );
         assert!(!view.ui);
     }
 
@@ -118,6 +143,10 @@ mod tests {
             ("camera", "1,2"),
             ("transfer", "{}"),
             ("background", "sky"),
+            ("channels", "red"),
+            ("mode", "dreamy"),
+            ("clip", "1,2"),
+            ("slice", "40"),
             ("ui", "maybe"),
         ] {
             let error = page(&[(name, value)]).unwrap_err().to_string();

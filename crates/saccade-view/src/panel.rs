@@ -3,9 +3,11 @@
 use egui::{Color32, RichText, Slider, Ui};
 use saccade_core::transfer::{ColorMap, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
+use saccade_render::Mode;
 use saccade_stream::Session;
 
 use crate::facts::{Piece, Tone};
+use crate::shown::{AXES, Shown, Slice};
 use crate::transfer_editor::{self, TransferEditor};
 
 /// What the user may set, apart from the camera and the transfer function.
@@ -16,6 +18,10 @@ pub(crate) struct Settings {
     pub(crate) false_colors: bool,
     /// Linear RGB.
     pub(crate) background: [f32; 3],
+    /// Which part of the volume, and how.
+    pub(crate) shown: Shown,
+    /// Channel whose colours and opacities are edited.
+    pub(crate) selected: u32,
 }
 
 /// Shows the panel and applies what the user does in it. Whether the camera is to go home.
@@ -29,7 +35,14 @@ pub(crate) fn show(
         .show(ui, |ui| {
             describe(ui, &session.volume().clone());
             ui.separator();
-            transfer(ui, session, editor);
+            if session.channels().len() > 1 {
+                channels(ui, session, &mut settings.selected);
+                ui.separator();
+            }
+            transfer(ui, session, editor, settings.selected);
+            ui.separator();
+            let volume = session.volume().clone();
+            shown(ui, session, settings, &volume);
             ui.separator();
             picture(ui, settings);
             ui.separator();
@@ -54,10 +67,49 @@ fn describe(ui: &mut Ui, volume: &Volume) {
     ui.label(format!("{} × {} × {} nm per voxel", nm.x, nm.y, nm.z));
 }
 
-fn transfer(ui: &mut Ui, session: &mut Session, editor: &mut TransferEditor) {
-    let mut transfer = session.transfer_function().clone();
-    let mut changed =
-        transfer_editor::show(ui, editor, &mut transfer, &session.histogram().clone());
+/// The volume's channels: which are seen, and which is edited.
+fn channels(ui: &mut Ui, session: &mut Session, selected: &mut u32) {
+    let list = session.channels().iter();
+    let list: Vec<_> = list
+        .map(|c| {
+            (
+                c.name.clone(),
+                c.visible,
+                c.transfer.color_at(c.transfer.window[1]),
+            )
+        })
+        .collect();
+    let mut refused = None;
+    egui::ScrollArea::vertical()
+        .id_salt("channels")
+        .max_height(180.0)
+        .show(ui, |ui| {
+            for (index, (name, visible, [r, g, b])) in (0..).zip(list) {
+                ui.horizontal(|ui| {
+                    let mut seen = visible;
+                    if ui.checkbox(&mut seen, "").changed() {
+                        refused = session.set_visible(index, seen).err();
+                    }
+                    let color: Color32 = egui::Rgba::from_rgb(r, g, b).into();
+                    let text = RichText::new(name).color(color);
+                    if ui.selectable_label(*selected == index, text).clicked() {
+                        *selected = index;
+                    }
+                });
+            }
+        });
+    if let Some(error) = refused {
+        // Said for as long as the pointer stays.
+        ui.colored_label(ui.visuals().error_fg_color, error.to_string());
+    }
+}
+
+fn transfer(ui: &mut Ui, session: &mut Session, editor: &mut TransferEditor, selected: u32) {
+    let Some(channel) = session.channels().get(selected as usize).cloned() else {
+        return;
+    };
+    let mut transfer = channel.transfer;
+    let mut changed = transfer_editor::show(ui, editor, &mut transfer, &channel.histogram);
     changed |= polarity(ui, &mut transfer);
     egui::ComboBox::from_label("Colours")
         .selected_text(map_name(transfer.color_map))
@@ -67,24 +119,102 @@ fn transfer(ui: &mut Ui, session: &mut Session, editor: &mut TransferEditor) {
                 changed |= ui.selectable_value(value, map, map_name(map)).changed();
             }
         });
+    let span = transfer_editor::span(&channel.histogram);
     let [low, high] = &mut transfer.window;
     changed |= ui
-        .add(Slider::new(low, 0.0..=1.0).text("First colour at"))
+        .add(Slider::new(low, 0.0..=span).text("First colour at"))
         .changed();
     changed |= ui
-        .add(Slider::new(high, 0.0..=1.0).text("Last colour at"))
+        .add(Slider::new(high, 0.0..=span).text("Last colour at"))
         .changed();
-    if changed {
-        session.set_transfer_function(transfer);
-    }
-    let automatic = session.is_transfer_function_automatic();
-    let button = ui.add_enabled(!automatic, egui::Button::new("Follow the data"));
-    if button
+    let done = if changed {
+        session.set_transfer_function(selected, transfer)
+    } else {
+        Ok(())
+    };
+    let button = ui.add_enabled(!channel.automatic, egui::Button::new("Follow the data"));
+    let follow = button
         .on_hover_text("Colours and opacities from the histogram, while data arrive")
-        .clicked()
-    {
-        session.set_automatic_transfer_function();
+        .clicked();
+    let followed = match follow {
+        true => session.set_automatic_transfer_function(selected),
+        false => Ok(()),
+    };
+    if let Err(error) = done.and(followed) {
+        log::error!("{error}");
     }
+}
+
+/// How samples become a picture, and what is cut away.
+fn shown(ui: &mut Ui, session: &mut Session, settings: &mut Settings, volume: &Volume) {
+    let shown = &mut settings.shown;
+    ui.horizontal(|ui| {
+        for (mode, name, what) in [
+            (
+                Mode::EmissionAbsorption,
+                "Light",
+                "Light that matter sends out and takes up",
+            ),
+            (
+                Mode::Maximum,
+                "Maximum",
+                "The strongest value along each ray",
+            ),
+            (
+                Mode::IsoSurface,
+                "Surface",
+                "Where values pass a bound, lit from the eye",
+            ),
+        ] {
+            ui.selectable_value(&mut shown.mode, mode, name)
+                .on_hover_text(what);
+        }
+    });
+    if shown.drawn_mode() == Mode::IsoSurface
+        && let Some(channel) = session.channels().get(settings.selected as usize)
+    {
+        let span = transfer_editor::span(&channel.histogram);
+        let mut iso = channel.iso_value();
+        let slider = ui.add(Slider::new(&mut iso, 0.0..=span).text("Surface at"));
+        if slider.changed()
+            && let Err(error) = session.set_iso(settings.selected, Some(iso))
+        {
+            log::error!("{error}");
+        }
+    }
+    let extent = volume.extent().as_dvec3();
+    ui.horizontal(|ui| {
+        ui.label("Slice");
+        let axis = shown.slice.map(|slice| slice.axis);
+        if ui.selectable_label(axis.is_none(), "none").clicked() {
+            shown.slice = None;
+        }
+        for (index, name) in AXES.into_iter().enumerate() {
+            if ui.selectable_label(axis == Some(index), name).clicked() {
+                let at = extent[index] / 2.0;
+                shown.slice = Some(Slice { axis: index, at });
+            }
+        }
+    });
+    if let Some(slice) = &mut shown.slice {
+        ui.add(Slider::new(&mut slice.at, 0.0..=extent[slice.axis]).text("voxel"));
+    }
+    ui.collapsing("Cut away", |ui| {
+        let [mut low, mut high] = shown.within.unwrap_or([glam::DVec3::ZERO, extent]);
+        let mut changed = false;
+        for (axis, name) in AXES.into_iter().enumerate() {
+            let from = Slider::new(&mut low[axis], 0.0..=extent[axis]).text(format!("{name} from"));
+            changed |= ui.add(from).changed();
+            let to = Slider::new(&mut high[axis], 0.0..=extent[axis]).text(format!("{name} to"));
+            changed |= ui.add(to).changed();
+        }
+        if changed {
+            shown.within = Some([low, high.max(low)]);
+        }
+        if ui.button("Nothing").clicked() {
+            shown.within = None;
+        }
+    });
 }
 
 fn polarity(ui: &mut Ui, transfer: &mut TransferFunction) -> bool {
@@ -105,6 +235,10 @@ fn map_name(map: ColorMap) -> &'static str {
         ColorMap::Inferno => "Inferno",
         ColorMap::Green => "Green",
         ColorMap::Magenta => "Magenta",
+        ColorMap::Cyan => "Cyan",
+        ColorMap::Yellow => "Yellow",
+        ColorMap::Red => "Red",
+        ColorMap::Blue => "Blue",
     }
 }
 

@@ -97,7 +97,17 @@ fn page_options(search: &str) -> Result<PageOptions, String> {
     let query = search.trim_start_matches('?');
     let parameters =
         web_sys::UrlSearchParams::new_with_str(query).map_err(|error| format!("{error:?}"))?;
-    let names = ["volume", "camera", "transfer", "background", "ui"];
+    let names = [
+        "volume",
+        "camera",
+        "channels",
+        "transfer",
+        "mode",
+        "clip",
+        "slice",
+        "background",
+        "ui",
+    ];
     let pairs = names
         .iter()
         .filter_map(|name| Some(((*name).to_owned(), parameters.get(name)?)));

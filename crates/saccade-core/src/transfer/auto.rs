@@ -3,30 +3,55 @@
 use glam::DVec3;
 
 use super::{ColorMap, OpacityPoint, TransferFunction};
-use crate::volume::Polarity;
+use crate::volume::{Dtype, Polarity};
 
 /// Share of the range of values below which the median means background.
 const BACKGROUND_BELOW: f64 = 0.43;
 
-/// Counts of 8-bit values. Value 0, nothing acquired, is not counted.
+/// Counts of measured values. Value 0, nothing acquired, is not counted.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Histogram {
-    counts: [u64; 256],
+    dtype: Dtype,
+    /// One per value of the type.
+    counts: Vec<u64>,
 }
 
 impl Default for Histogram {
     fn default() -> Self {
-        Self { counts: [0; 256] }
+        Self::new(Dtype::Uint8)
     }
 }
 
 impl Histogram {
-    /// Counts more voxels.
-    pub fn add(&mut self, values: &[u8]) {
-        for &value in values {
-            self.counts[usize::from(value)] += 1;
+    /// Nothing counted yet.
+    pub fn new(dtype: Dtype) -> Self {
+        Self {
+            dtype,
+            counts: vec![0; 1 << (8 * dtype.bytes())],
+        }
+    }
+
+    /// Counts more voxels, as sources give them: of the histogram's type, little-endian.
+    pub fn add(&mut self, voxels: &[u8]) {
+        match self.dtype {
+            Dtype::Uint8 => {
+                for &value in voxels {
+                    self.counts[usize::from(value)] += 1;
+                }
+            }
+            Dtype::Uint16 => {
+                let (values, _) = voxels.as_chunks::<2>();
+                for &value in values {
+                    self.counts[usize::from(u16::from_le_bytes(value))] += 1;
+                }
+            }
         }
         self.counts[0] = 0;
+    }
+
+    /// Type of the values.
+    pub fn dtype(&self) -> Dtype {
+        self.dtype
     }
 
     /// Voxels counted.
@@ -35,21 +60,54 @@ impl Histogram {
     }
 
     /// Count per value.
-    pub fn counts(&self) -> &[u64; 256] {
+    pub fn counts(&self) -> &[u64] {
         &self.counts
     }
 
+    /// Counts of `bars` equal parts of a range of values, `[0, 1]` of the type's: from low to high.
+    pub fn bars(&self, [low, high]: [f32; 2], bars: usize) -> Vec<u64> {
+        let mut sums = vec![0; bars];
+        let largest = f32::from(self.largest());
+        let width = (high - low).max(f32::MIN_POSITIVE);
+        for (value, &count) in (0..=u16::MAX).zip(&self.counts) {
+            let at = (f32::from(value) / largest - low) / width;
+            if count > 0 && (0.0..=1.0).contains(&at) {
+                #[expect(clippy::cast_possible_truncation, reason = "from 0 to 1")]
+                #[expect(clippy::cast_sign_loss, reason = "from 0 to 1")]
+                let bar = (at * bars as f32) as usize;
+                sums[bar.min(bars.saturating_sub(1))] += count;
+            }
+        }
+        sums
+    }
+
+    /// Largest value that the type has.
+    pub fn largest(&self) -> u16 {
+        match self.dtype {
+            Dtype::Uint8 => u16::from(u8::MAX),
+            Dtype::Uint16 => u16::MAX,
+        }
+    }
+
     /// Smallest value that at least this share of the voxels does not exceed.
-    pub fn percentile(&self, share: f64) -> u8 {
+    pub fn percentile(&self, share: f64) -> u16 {
         let want = share * self.total() as f64;
         let mut seen = 0;
-        for (value, &count) in (0..=u8::MAX).zip(&self.counts) {
+        for (value, &count) in (0..=u16::MAX).zip(&self.counts) {
             seen += count;
             if seen > 0 && seen as f64 >= want {
                 return value;
             }
         }
-        u8::MAX
+        self.largest()
+    }
+
+    /// Bits that nearly all values counted fit in, 8 at least; all the type has where none was counted.
+    pub fn significant_bits(&self) -> u32 {
+        match self.total() {
+            0 => self.largest().ilog2() + 1,
+            _ => (self.percentile(0.9999).max(1).ilog2() + 1).max(8),
+        }
     }
 
     /// Where the structures are. Electron micrographs fill their range of values, bulk in the
@@ -73,25 +131,31 @@ impl Histogram {
     /// `size_nm` is the volume's size \[nm\]: opacity is chosen so that a ray sees some depth of a
     /// block and a thin slab is still seen. An empty histogram gives a plain ramp over all values.
     pub fn transfer_function(&self, size_nm: DVec3) -> TransferFunction {
-        let polarity = self.polarity();
-        let unit = |v: u8| f32::from(v) / 255.0;
+        self.transfer_function_of(self.polarity(), size_nm)
+    }
+
+    /// [`Self::transfer_function`] where it is known which structures are to be seen.
+    pub fn transfer_function_of(&self, polarity: Polarity, size_nm: DVec3) -> TransferFunction {
+        let largest = f32::from(self.largest());
+        let unit = |v: u16| f32::from(v) / largest;
+        let step = 1.0 / largest;
         let [low, high] = if self.total() == 0 {
             [0.0, 1.0]
         } else {
             [0.005, 0.995].map(|p| unit(self.percentile(p)))
         };
-        let high = high.max(low + 2.0 / 255.0);
+        let high = high.max(low + 2.0 * step);
         let point = |value, opacity| OpacityPoint { value, opacity };
         let (longest, shortest) = (size_nm.max_element(), size_nm.min_element());
         let (opacity, opacity_length_nm) = match polarity {
             Polarity::Dark => {
-                let from = unit(self.percentile(0.05)).max(low + 0.5 / 255.0);
-                let to = unit(self.percentile(0.97)).max(from + 1.0 / 255.0);
+                let from = unit(self.percentile(0.05)).max(low + 0.5 * step);
+                let to = unit(self.percentile(0.97)).max(from + step);
                 let points = vec![point(from, 0.95), point(to, 0.35)];
                 (points, (longest / 128.0).min(shortest / 4.0))
             }
             Polarity::Bright => {
-                let from = unit(self.percentile(0.60)).min(high - 1.5 / 255.0).max(low);
+                let from = unit(self.percentile(0.60)).min(high - 1.5 * step).max(low);
                 let points = vec![point(from, 0.0), point(high, 0.85)];
                 (points, (longest / 64.0).min(shortest / 2.0))
             }
@@ -143,6 +207,47 @@ mod tests {
         let tf = bell(30.0, 10.0, 160.0).transfer_function(DVec3::new(4e5, 2e5, 600.0));
         let slab = super::super::opacity_of_length(0.8, 600.0, tf.opacity_length_nm);
         assert!(slab > 0.9, "three sections across show only {slab}");
+    }
+
+    /// Twelve bits in sixteen look as the same values in eight do.
+    #[test]
+    fn depth_does_not_change_the_look() {
+        let eight = bell(30.0, 10.0, 160.0);
+        let mut sixteen = Histogram::new(Dtype::Uint16);
+        for (value, &count) in (0..=255_u16).zip(eight.counts()) {
+            sixteen.add(
+                &(value * 16)
+                    .to_le_bytes()
+                    .repeat(usize::try_from(count).unwrap()),
+            );
+        }
+        assert_eq!(
+            (sixteen.total(), eight.total()),
+            (sixteen.total(), sixteen.total())
+        );
+        assert_eq!(
+            (eight.significant_bits(), sixteen.significant_bits()),
+            (8, 12)
+        );
+        let size = DVec3::splat(1000.0);
+        let [of_eight, of_sixteen] = [&eight, &sixteen].map(|h| h.transfer_function(size));
+        assert_eq!(of_eight.polarity, of_sixteen.polarity);
+        let scale = 16.0 * 255.0 / 65_535.0;
+        for (a, b) in of_eight.opacity.iter().zip(&of_sixteen.opacity) {
+            assert!((a.value * scale - b.value).abs() < 1e-5 && a.opacity == b.opacity);
+        }
+        assert_eq!(
+            eight.bars([0.0, 1.0], 256).iter().sum::<u64>(),
+            eight.total()
+        );
+        let few = sixteen.bars([0.0, 255.0 * 16.0 / 65_535.0], 8);
+        let same = eight.bars([0.0, 1.0], 8);
+        assert!(
+            few.iter()
+                .zip(&same)
+                .all(|(a, b)| a.abs_diff(*b) * 20 <= eight.total()),
+            "{few:?}, {same:?}"
+        );
     }
 
     #[test]

@@ -21,18 +21,44 @@ pub enum ColorMap {
     Green,
     /// Black to magenta: beside green, for the colour-blind.
     Magenta,
+    /// Black to cyan.
+    Cyan,
+    /// Black to yellow.
+    Yellow,
+    /// Black to red.
+    Red,
+    /// Black to a blue that is bright enough to be seen.
+    Blue,
 }
 
 impl ColorMap {
     /// Every map, in the order menus show them.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 10] = [
         Self::Gray,
         Self::Bone,
         Self::Viridis,
         Self::Inferno,
         Self::Green,
         Self::Magenta,
+        Self::Cyan,
+        Self::Yellow,
+        Self::Red,
+        Self::Blue,
     ];
+
+    /// Maps of one hue each, for the first channel, the second, and so on, again from the start.
+    pub fn of_channel(channel: u32) -> Self {
+        const HUES: [ColorMap; 7] = [
+            ColorMap::Green,
+            ColorMap::Magenta,
+            ColorMap::Cyan,
+            ColorMap::Yellow,
+            ColorMap::Red,
+            ColorMap::Blue,
+            ColorMap::Gray,
+        ];
+        HUES[channel as usize % HUES.len()]
+    }
 
     /// Evenly spaced corners, sRGB bytes.
     const fn corners(self) -> &'static [[u8; 3]] {
@@ -55,6 +81,10 @@ impl ColorMap {
             ],
             Self::Green => &[[0, 0, 0], [0, 255, 0]],
             Self::Magenta => &[[0, 0, 0], [255, 0, 255]],
+            Self::Cyan => &[[0, 0, 0], [0, 255, 255]],
+            Self::Yellow => &[[0, 0, 0], [255, 255, 0]],
+            Self::Red => &[[0, 0, 0], [255, 40, 40]],
+            Self::Blue => &[[0, 0, 0], [70, 110, 255]],
         }
     }
 

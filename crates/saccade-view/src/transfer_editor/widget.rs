@@ -8,15 +8,51 @@ use super::{PlotPoint, TransferEditor, add, bars, near, remove};
 const HEIGHT: f32 = 140.0;
 const RAMP: f32 = 12.0;
 const CORNER: f32 = 5.0;
+/// Bars of the histogram.
+const BARS: usize = 256;
 /// How far from a corner the hand still takes it \[points\].
 const REACH: f32 = 12.0;
 
 /// Shows the plot and applies what the user does to it. Whether `transfer` changed.
+///
+/// The plot spans the values that there are: 16-bit microscopes rarely use all their bits.
 pub(crate) fn show(
     ui: &mut Ui,
     editor: &mut TransferEditor,
     transfer: &mut TransferFunction,
     histogram: &Histogram,
+) -> bool {
+    let span = span(histogram);
+    let mut plotted = stretched(transfer, 1.0 / span);
+    let changed = show_plot(ui, editor, &mut plotted, &histogram.bars([0.0, span], BARS));
+    if changed {
+        *transfer = stretched(&plotted, span);
+    }
+    changed
+}
+
+/// Value at the right edge of the plot.
+pub(crate) fn span(histogram: &Histogram) -> f32 {
+    let largest = f32::from(histogram.largest());
+    let bits = histogram.significant_bits();
+    (((1_u32 << bits) - 1) as f32 / largest).min(1.0)
+}
+
+/// The same with values `factor` times as large.
+fn stretched(transfer: &TransferFunction, factor: f32) -> TransferFunction {
+    let mut stretched = transfer.clone();
+    stretched.window = stretched.window.map(|value| value * factor);
+    for corner in &mut stretched.opacity {
+        corner.value *= factor;
+    }
+    stretched
+}
+
+fn show_plot(
+    ui: &mut Ui,
+    editor: &mut TransferEditor,
+    transfer: &mut TransferFunction,
+    counts: &[u64],
 ) -> bool {
     let size = vec2(ui.available_width(), HEIGHT + RAMP);
     let (whole, response) = ui.allocate_exact_size(size, Sense::click_and_drag());
@@ -54,14 +90,7 @@ pub(crate) fn show(
     }
     let hovered = response.hover_pos().map(|p| plot_from_screen(plot, p));
     let hovered = hovered.and_then(|p| near(transfer, p, reach));
-    paint(
-        ui,
-        whole,
-        plot,
-        transfer,
-        histogram,
-        editor.held().or(hovered),
-    );
+    paint(ui, whole, plot, transfer, counts, editor.held().or(hovered));
     changed
 }
 
@@ -82,18 +111,18 @@ fn paint(
     whole: Rect,
     plot: Rect,
     transfer: &TransferFunction,
-    histogram: &Histogram,
+    counts: &[u64],
     active: Option<usize>,
 ) {
     let painter = ui.painter_at(whole.expand(CORNER + 2.0));
     let visuals = ui.visuals();
     painter.rect_filled(whole, 2.0, visuals.extreme_bg_color);
 
-    let bar = plot.width() / 256.0;
+    let bar = plot.width() / BARS as f32;
     let faint = visuals.weak_text_color().gamma_multiply(0.5);
-    for (value, height) in (0..=u8::MAX).zip(bars(histogram.counts())) {
+    for (index, height) in bars(counts).into_iter().enumerate() {
         if height > 0.0 {
-            let top = screen_from_plot(plot, f32::from(value) / 256.0, height);
+            let top = screen_from_plot(plot, index as f32 / BARS as f32, height);
             let rect = Rect::from_min_max(top, pos2(top.x + bar, plot.max.y));
             painter.rect_filled(rect, 0.0, faint);
         }
@@ -225,6 +254,20 @@ mod tests {
             self.button(at, button, true);
             self.button(at, button, false);
         }
+    }
+
+    /// Twelve bits in sixteen fill the plot, and what the hand does is told in values.
+    #[test]
+    fn the_plot_spans_the_values_there_are() {
+        let mut histogram = Histogram::new(saccade_core::volume::Dtype::Uint16);
+        assert_eq!(span(&histogram), 1.0);
+        histogram.add(&3000_u16.to_le_bytes().repeat(500));
+        let span = span(&histogram);
+        assert!((span - 4095.0 / 65_535.0).abs() < 1e-6);
+        let plain = histogram.transfer_function(glam::DVec3::ONE);
+        let back = stretched(&stretched(&plain, 1.0 / span), span);
+        assert!((back.window[1] - plain.window[1]).abs() < 1e-6);
+        assert!((back.opacity[0].value - plain.opacity[0].value).abs() < 1e-6);
     }
 
     #[test]

@@ -5,17 +5,28 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use glam::UVec2;
+use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
 use saccade_core::transfer::TransferFunction;
-use saccade_render::{Gpu, View};
+use saccade_render::{Gpu, Mode, View};
 use saccade_stream::{Session, SessionOptions, SettleError, Status};
-use saccade_view::background_from_text;
+use saccade_view::{
+    Shown, ShownError, Slice, background_from_text, box_from_text, channels_from_text,
+    mode_from_text, show_channels, slice_from_text,
+};
 
 use crate::arguments::{CatalogArgument, picture, picture_size, seconds};
 use crate::open::Place;
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
+
+/// A list of channels, in one argument.
+#[derive(Clone)]
+struct Channels(Vec<u32>);
+
+fn channels(text: &str) -> Result<Channels, ShownError> {
+    channels_from_text(text).map(Channels)
+}
 
 /// Draw a volume into a PNG file. Waits until the picture is complete.
 #[derive(Args)]
@@ -45,7 +56,29 @@ pub(crate) struct Render {
     #[arg(long, value_name = "WxH", value_parser = picture_size, default_value = "1280x720")]
     size: UVec2,
 
-    /// Colours and opacities: auto, a JSON file, or JSON itself
+    /// Channels to show, as numbers from 0 with commas [default: the first four]
+    #[arg(long, value_name = "N,...", value_parser = channels)]
+    channels: Option<Channels>,
+
+    /// How to draw: light (that matter sends out and takes up), maximum (the strongest value along
+    /// each ray) or surface (where values pass a bound)
+    #[arg(long, value_parser = mode_from_text, default_value = "light")]
+    mode: Mode,
+
+    /// With --mode surface, the value of the surface, 0 to 1 of the value type's range [default: between the
+    /// opacities' ends]
+    #[arg(long, value_name = "VALUE")]
+    iso: Option<f32>,
+
+    /// Show a part only: two opposite corners [voxels of the finest level]
+    #[arg(long, value_name = "X,Y,Z,X,Y,Z", value_parser = box_from_text, allow_hyphen_values = true)]
+    clip: Option<[DVec3; 2]>,
+
+    /// Show one plane, as in z=40 [voxels of the finest level]
+    #[arg(long, value_name = "AXIS=VOXEL", value_parser = slice_from_text)]
+    slice: Option<Slice>,
+
+    /// Colours and opacities of the first channel shown: auto, a JSON file, or JSON itself
     #[arg(long, value_name = "JSON", default_value = "auto")]
     transfer: String,
 
@@ -97,11 +130,22 @@ impl Render {
             .camera
             .unwrap_or_else(|| Camera::around(source.volume()));
         let mut session = Session::new(&gpu, source, options)?;
-        if let Some(transfer) = transfer {
-            session.set_transfer_function(transfer);
+        let channels = self.channels.as_ref().map(|Channels(list)| &list[..]);
+        show_channels(&mut session, channels, transfer)?;
+        if let Some(iso) = self.iso {
+            for channel in (0..).take(session.channels().len()) {
+                session.set_iso(channel, Some(iso))?;
+            }
         }
+        let shown = Shown {
+            mode: self.mode,
+            within: self.clip,
+            slice: self.slice,
+        };
         let view = View {
             background: self.background,
+            mode: shown.drawn_mode(),
+            clip: shown.clip(session.volume()),
             lod_bias: self.lod_bias,
             ..View::new(camera, self.size)
         };
