@@ -86,6 +86,9 @@ pub struct StitchedOptions {
     pub sub_tile_bytes: u64,
     /// Memory for the indices of pyramids \[bytes\].
     pub index_bytes: u64,
+    /// Memory for where the tiles of sections lie \[bytes\]: about 300 for each tile of those looked at
+    /// last.
+    pub section_bytes: u64,
     /// Blocks built at a time.
     pub builds: usize,
     /// What lies between pixels.
@@ -109,6 +112,7 @@ impl Default for StitchedOptions {
             block_bytes: 512 << 20,
             sub_tile_bytes: 256 << 20,
             index_bytes: 64 << 20,
+            section_bytes: 256 << 20,
             interpolation: Interpolation::Linear,
             overlaps: Overlaps::NearestCentre,
             along_z: AlongZ::Nearest,
@@ -207,7 +211,9 @@ impl StitchedSource {
         };
         let entry = catalog.entry(name).await.map_err(failed)?;
         let volume = Arc::new(entry.volume);
-        let index = TileIndex::open(&catalog, name).await.map_err(failed)?;
+        let index = TileIndex::open(&catalog, name, options.section_bytes)
+            .await
+            .map_err(failed)?;
         let tiles = Tiles::new(archive, index, volume.dtype, &options);
         let disk = match options.disk_cache.clone() {
             Some(disk) => {

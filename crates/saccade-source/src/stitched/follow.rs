@@ -3,7 +3,8 @@
 use std::sync::Weak;
 use std::time::Duration;
 
-use saccade_archive::catalog::{Catalog, CatalogChange, CatalogError, ChangeReason};
+use saccade_archive::catalog::{Catalog, CatalogError, ChangeReason};
+#[cfg(test)]
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::watch;
 
@@ -52,26 +53,85 @@ async fn catch_up(
         // First what is known, then what was built of it, then the news: whoever reads after the
         // news gets neither.
         let turned = inner.builder.tiles().index().apply(&changes).await;
-        for change in changes {
+        let told = changes.iter().map(|change| {
             let all = turned.contains(&change.section);
-            inner.tell(&change, inner.builder.touched(change.voxels, all));
+            Change {
+                revision: change.revision,
+                voxels: inner.builder.touched(change.voxels, all),
+                reason: reason(change.reason),
+            }
+        });
+        for change in merged(told.collect()) {
+            inner.forget(change.voxels);
+            inner.changes.send(change);
             *seen = change.revision;
         }
     }
     Ok(())
 }
 
-impl Inner {
-    fn tell(&self, change: &CatalogChange, voxels: VoxelBox) {
-        self.forget(voxels);
-        self.changes.send(Change {
-            revision: change.revision,
-            voxels,
-            reason: match change.reason {
-                ChangeReason::Tile => crate::ChangeReason::Tile,
-                ChangeReason::Transform => crate::ChangeReason::Transform,
-                ChangeReason::Deleted => crate::ChangeReason::Deleted,
-            },
+fn reason(reason: ChangeReason) -> crate::ChangeReason {
+    match reason {
+        ChangeReason::Tile => crate::ChangeReason::Tile,
+        ChangeReason::Transform => crate::ChangeReason::Transform,
+        ChangeReason::Deleted => crate::ChangeReason::Deleted,
+    }
+}
+
+/// Changes that follow one another as one, where their common box is no larger than both: all tiles of
+/// a section that is aligned anew become few boxes, however many they are.
+fn merged(mut changes: Vec<Change>) -> Vec<Change> {
+    loop {
+        let before = changes.len();
+        changes.dedup_by(|next, change| {
+            let union = change.voxels.union(next.voxels);
+            let both = change.voxels.voxels().saturating_add(next.voxels.voxels());
+            let joins = change.reason == next.reason && union.voxels() <= both;
+            if joins {
+                (change.voxels, change.revision) = (union, next.revision);
+            }
+            joins
         });
+        // Rows of tiles first, then rows of rows.
+        if changes.len() == before {
+            return changes;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::UVec3;
+
+    use super::*;
+
+    fn change(revision: u64, min: [u32; 3], size: [u32; 3]) -> Change {
+        let min = UVec3::from(min);
+        Change {
+            revision,
+            voxels: VoxelBox::new(min, min + UVec3::from(size)),
+            reason: crate::ChangeReason::Transform,
+        }
+    }
+
+    #[test]
+    fn a_section_is_one_change_and_what_lies_apart_is_not() {
+        // Twenty by eighteen tiles that overlap by a tenth.
+        let grid = (0..18).flat_map(|y| (0..20).map(move |x| (x, y)));
+        let tiles = (1..).zip(grid);
+        let tiles: Vec<_> = tiles
+            .map(|(n, (x, y))| change(n, [x * 90, y * 90, 7], [100, 100, 1]))
+            .collect();
+        let one = merged(tiles.clone());
+        assert_eq!(one, [change(360, [0, 0, 7], [1810, 1630, 1])]);
+
+        let mut apart = vec![tiles[0], change(2, [300, 0, 7], [100, 100, 1])];
+        assert_eq!(merged(apart.clone()), apart);
+        apart[1] = change(2, [90, 0, 8], [100, 100, 1]);
+        assert_eq!(merged(apart.clone()), apart, "another section");
+        let mut other = tiles[1];
+        other.reason = crate::ChangeReason::Tile;
+        assert_eq!(merged(vec![tiles[0], other]).len(), 2);
+        assert_eq!(merged(Vec::new()), []);
     }
 }

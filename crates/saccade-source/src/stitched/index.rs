@@ -18,31 +18,108 @@ pub(super) use tile::IndexedTile;
 
 type Cell = Arc<OnceCell<Arc<SectionIndex>>>;
 
+/// A section that is loaded, or being loaded.
+#[derive(Default)]
+struct Section {
+    cell: Cell,
+    /// When it was last asked for, in questions.
+    used: u64,
+    /// Memory it takes; 0 until it is loaded.
+    bytes: u64,
+}
+
+#[derive(Default)]
+struct Sections {
+    by_number: BTreeMap<u32, Section>,
+    /// Questions so far.
+    asked: u64,
+    /// Memory of all \[bytes\].
+    bytes: u64,
+}
+
+impl Sections {
+    fn cell(&mut self, z: u32) -> Cell {
+        self.asked += 1;
+        let section = self.by_number.entry(z).or_default();
+        section.used = self.asked;
+        section.cell.clone()
+    }
+
+    fn retain(&mut self, keep: impl Fn(u32, &Section) -> bool) {
+        self.by_number.retain(|z, section| keep(*z, section));
+        self.bytes = self.by_number.values().map(|s| s.bytes).sum();
+    }
+
+    /// Counts what was loaded, and forgets those not asked for longest beyond `most` bytes; never the
+    /// one that was loaded.
+    fn loaded(&mut self, z: u32, cell: &Cell, most: u64) {
+        let section = self.by_number.get_mut(&z);
+        let Some(section) = section.filter(|s| s.bytes == 0 && Arc::ptr_eq(&s.cell, cell)) else {
+            return;
+        };
+        section.bytes = cell.get().map_or(0, |index| index.bytes() as u64);
+        self.bytes += section.bytes;
+        while self.bytes > most {
+            let others = self.by_number.iter();
+            let others = others.filter(|(number, section)| **number != z && section.bytes > 0);
+            let Some(oldest) = others
+                .min_by_key(|(_, s)| s.used)
+                .map(|(number, _)| *number)
+            else {
+                return;
+            };
+            let removed = self.by_number.remove(&oldest);
+            self.bytes -= removed.map_or(0, |section| section.bytes);
+        }
+    }
+
+    /// Puts a newer state of a loaded section in its place.
+    fn replace(&mut self, z: u32, update: impl FnOnce(&SectionIndex) -> SectionIndex) {
+        if let Some(section) = self.by_number.get_mut(&z)
+            && let Some(old) = section.cell.get()
+        {
+            let index = Arc::new(update(old));
+            self.bytes -= section.bytes;
+            section.bytes = index.bytes() as u64;
+            self.bytes += section.bytes;
+            section.cell = Arc::new(OnceCell::new_with(Some(index)));
+        }
+    }
+}
+
 /// Where the tiles of a volume lie \[000 §5.1\].
 ///
 /// Knows from the start which sections have tiles, and loads a section's when it is first asked for.
-/// From then on [`Self::apply`] keeps it as the catalog has it.
+/// From then on [`Self::apply`] keeps it as the catalog has it, until others need its memory.
 pub struct TileIndex {
     catalog: Catalog,
     volume: Box<str>,
     /// Sections that have a tile.
     acquired: Mutex<BTreeSet<u32>>,
-    sections: Mutex<BTreeMap<u32, Cell>>,
+    sections: Mutex<Sections>,
+    /// Memory for sections \[bytes\].
+    most_bytes: u64,
 }
 
 impl TileIndex {
-    /// Of a volume. Reads which sections have tiles, and nothing of the tiles.
+    /// Of a volume. Reads which sections have tiles, and nothing of the tiles. Keeps sections of at most
+    /// `most_bytes`, one at least.
     ///
     /// # Errors
     ///
     /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn open(catalog: &Catalog, volume: &str) -> Result<Self, CatalogError> {
+    pub async fn open(
+        catalog: &Catalog,
+        volume: &str,
+        most_bytes: u64,
+    ) -> Result<Self, CatalogError> {
         let acquired = catalog.sections(volume).await?;
         Ok(Self {
             catalog: catalog.clone(),
             volume: volume.into(),
             acquired: Mutex::new(acquired.into_iter().collect()),
             sections: Mutex::default(),
+            most_bytes,
         })
     }
 
@@ -70,13 +147,15 @@ impl TileIndex {
     ///
     /// What the database says; it is asked again the next time.
     pub async fn section(&self, z: u32) -> Result<Arc<SectionIndex>, CatalogError> {
-        let cell = lock(&self.sections).entry(z).or_default().clone();
+        let cell = lock(&self.sections).cell(z);
         // A load that was under way when the section changed ends in a cell that nobody asks again.
         let load = async || {
             let tiles = self.catalog.section_tiles(&self.volume, z).await?;
             Ok(Arc::new(SectionIndex::new(&tiles)))
         };
-        cell.get_or_try_init(load).await.cloned()
+        let index = cell.get_or_try_init(load).await.cloned();
+        lock(&self.sections).loaded(z, &cell, self.most_bytes);
+        index
     }
 
     /// Follows the catalog: what is asked for after this shows these changes. Returns the sections that
@@ -98,15 +177,15 @@ impl TileIndex {
                 .insert(change.tile);
         }
         // Whoever begins to load a section from here on sees the changes.
-        let loading = |z: &u32, cell: &mut Cell| changed.contains_key(z) && !cell.initialized();
-        lock(&self.sections).retain(|z, cell| !loading(z, cell));
+        let loading = |z: u32, s: &Section| changed.contains_key(&z) && !s.cell.initialized();
+        lock(&self.sections).retain(|z, section| !loading(z, section));
         let ids: BTreeSet<TileId> = changed.values().flatten().copied().collect();
         let ids: Vec<_> = ids.into_iter().collect();
         let tiles = match self.catalog.tiles(&self.volume, &ids).await {
             Ok(tiles) => tiles,
             Err(error) => {
                 log::warn!("changed tiles cannot be read, their sections are forgotten: {error}");
-                lock(&self.sections).retain(|z, _| !changed.contains_key(z));
+                lock(&self.sections).retain(|z, _| !changed.contains_key(&z));
                 return turned;
             }
         };
@@ -118,12 +197,7 @@ impl TileIndex {
                 _ => TileUpdate::Remove(*id),
             });
             let loses = { updates.clone() }.any(|update| matches!(update, TileUpdate::Remove(_)));
-            if let Some(cell) = lock(&self.sections).get_mut(&z)
-                && let Some(old) = cell.get()
-            {
-                let index = Arc::new(old.updated(updates));
-                *cell = Arc::new(OnceCell::new_with(Some(index)));
-            }
+            lock(&self.sections).replace(z, |old| old.updated(updates));
             // Hardly ever: the microscope says that a tile is of another section than it said before.
             if loses && self.section(z).await.is_ok_and(|index| index.tiles() == 0) {
                 lock(&self.acquired).remove(&z);
@@ -135,22 +209,19 @@ impl TileIndex {
 
     /// Tiles of the sections that are loaded.
     pub fn tiles(&self) -> u64 {
-        self.loaded(|index| index.tiles() as u64)
+        let sections = lock(&self.sections);
+        let loaded = { sections.by_number.values() }.filter_map(|section| section.cell.get());
+        loaded.map(|index| index.tiles() as u64).sum()
     }
 
     /// Memory that it takes: all that is kept of tiles whose pyramid is not open \[bytes\].
     pub fn bytes(&self) -> u64 {
         // Entries of the two trees, which are at least half full.
-        let cell = size_of::<(u32, Cell)>() + size_of::<OnceCell<Arc<SectionIndex>>>() / 2;
-        let sections = 2 * lock(&self.sections).len() * cell;
+        let each = size_of::<(u32, Section)>() + size_of::<OnceCell<Arc<SectionIndex>>>() / 2;
         let acquired = 2 * lock(&self.acquired).len() * size_of::<u32>();
-        (size_of::<Self>() + sections + acquired) as u64 + self.loaded(|index| index.bytes() as u64)
-    }
-
-    fn loaded(&self, count: impl Fn(&SectionIndex) -> u64) -> u64 {
         let sections = lock(&self.sections);
-        let loaded = sections.values().filter_map(|cell| cell.get());
-        loaded.map(|index| count(index)).sum()
+        let entries = 2 * sections.by_number.len() * each;
+        (size_of::<Self>() + entries + acquired) as u64 + sections.bytes
     }
 }
 

@@ -15,6 +15,10 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::pyramid::{PyramidIndex, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_archive::storage::Storage;
 use saccade_core::volume::Dtype;
+use tokio::sync::Semaphore;
+
+/// Reads under way, at most: enough to hide a network's latency, few enough to leave files for others.
+const READS_AT_ONCE: usize = 64;
 
 /// An opened pyramid.
 pub(super) struct Pyramid {
@@ -127,6 +131,7 @@ pub(super) struct Tiles {
     storage: Arc<dyn Storage>,
     /// Of the volume.
     dtype: Dtype,
+    reads: Semaphore,
     pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
     sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
     next_serial: AtomicU64,
@@ -149,6 +154,7 @@ impl Tiles {
             index,
             storage: archive.storage().clone(),
             dtype,
+            reads: Semaphore::new(READS_AT_ONCE),
             pyramids: Cache::with_weighter(
                 items(options.index_bytes, 64 << 10),
                 options.index_bytes,
@@ -172,6 +178,7 @@ impl Tiles {
     /// The pyramid of a tile, opened if it is not open.
     pub(super) async fn pyramid(&self, tile: &IndexedTile) -> Result<Arc<Pyramid>, StitchError> {
         let open = async {
+            let _turn = self.reads.acquire().await;
             let opened = PyramidIndex::open(&*self.storage, &tile.pyramid).await;
             let index = opened.map_err(|source| {
                 let section = tile.section;
@@ -226,6 +233,7 @@ impl Tiles {
         let reads = pyramid.index.reads(level as usize, missing, gap);
         let name = pyramid.index.name();
         let read = reads.iter().map(async |read| {
+            let _turn = self.reads.acquire().await;
             let bytes = self.storage.read(name, Some(read.range.clone())).await;
             bytes.map_err(|source| {
                 let name = name.to_owned();

@@ -204,7 +204,7 @@ const ALL: (SectionPoint, SectionPoint) = (
 
 /// Tiles of each section, as two indices have them.
 async fn compare(kept: &TileIndex, catalog: &Catalog) {
-    let fresh = TileIndex::open(catalog, "v").await.unwrap();
+    let fresh = TileIndex::open(catalog, "v", u64::MAX).await.unwrap();
     for z in 0..9 {
         let (kept, fresh) = (
             kept.section(z).await.unwrap(),
@@ -229,7 +229,7 @@ async fn follows_the_catalog() {
         let tile = new_tile(&format!("t{n}"), n % 3, 100.0 * f64::from(n), u64::from(n));
         catalog.commit_tile("v", &tile).await.unwrap();
     }
-    let index = TileIndex::open(&catalog, "v").await.unwrap();
+    let index = TileIndex::open(&catalog, "v", u64::MAX).await.unwrap();
     assert_eq!(index.acquired(0..9), [0, 1, 2]);
     assert_eq!(
         (index.tiles(), index.any_acquired(3..9)),
@@ -305,7 +305,7 @@ async fn a_catalog_that_cannot_be_read_leaves_nothing_stale() {
         .commit_tile("v", &new_tile("a", 4, 0.0, 1))
         .await
         .unwrap();
-    let index = TileIndex::open(&catalog, "v").await.unwrap();
+    let index = TileIndex::open(&catalog, "v", u64::MAX).await.unwrap();
     assert_eq!(index.section(4).await.unwrap().tiles(), 1);
     catalog
         .commit_tile("v", &new_tile("b", 4, 300.0, 2))
@@ -318,4 +318,58 @@ async fn a_catalog_that_cannot_be_read_leaves_nothing_stale() {
         index.section(4).await.is_err(),
         "asked again, not answered from before"
     );
+}
+
+#[tokio::test]
+async fn memory_is_bounded_and_what_is_used_stays() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = Catalog::create(&folder.path().join("catalog.sqlite"))
+        .await
+        .unwrap();
+    let volume = Volume::new("v", UVec3::new(4000, 4000, 40), DVec3::new(4.0, 4.0, 30.0));
+    catalog.create_volume(&volume.unwrap()).await.unwrap();
+    for z in 0..40 {
+        let tile = new_tile(&format!("t{z}"), z, 10.0, u64::from(z) + 1);
+        catalog.commit_tile("v", &tile).await.unwrap();
+    }
+    let all = TileIndex::open(&catalog, "v", u64::MAX).await.unwrap();
+    let empty = all.bytes();
+    all.section(0).await.unwrap();
+    let each = all.bytes() - empty;
+    let index = TileIndex::open(&catalog, "v", 8 * each).await.unwrap();
+    let mut most = 0;
+    for z in 0..40 {
+        index.section(z).await.unwrap();
+        // This one is asked for again and again.
+        let first = index.section(0).await.unwrap();
+        most = most.max(index.bytes());
+        assert_eq!(first.tiles(), 1);
+    }
+    // Names differ in length.
+    assert!(most <= empty + 10 * each, "{most} of {}", 8 * each);
+    assert!(index.tiles() >= 7, "{} sections are left", index.tiles());
+    assert!(
+        { &index.sections }
+            .lock()
+            .unwrap()
+            .by_number
+            .contains_key(&0)
+    );
+    assert!(
+        !{ &index.sections }
+            .lock()
+            .unwrap()
+            .by_number
+            .contains_key(&3)
+    );
+
+    // What was forgotten comes back as it is now.
+    let moved = new_tile("t3", 3, 500.0, 100);
+    let before = catalog.revision("v").await.unwrap();
+    catalog.commit_tile("v", &moved).await.unwrap();
+    index
+        .apply(&catalog.changes_after("v", before).await.unwrap())
+        .await;
+    let near = index.section(3).await.unwrap().near(0, ALL.0.0, ALL.1.0);
+    assert!(near[0].min.x > 400.0, "{near:?}");
 }
