@@ -85,6 +85,10 @@ class S3(unittest.TestCase):
         self.whole()
         self.assertEqual(sorted(self.store.names(self.prefix)), sorted(self.want), "objects that nobody names")
 
+    def checked(self):
+        done = run("check", *self.archive)
+        return done.returncode, done.stdout + done.stderr
+
     def picture(self, *archive):
         out = self.work / f"{self.prefix}.png"
         drawn = run("render", *archive, "-o", out, *CAMERA)
@@ -111,6 +115,13 @@ class S3(unittest.TestCase):
             there, here = [chunk(url, key) for url in served]
             self.assertEqual(there, here, key)
             self.assertTrue(here and any(here), key)
+        code, said = self.checked()
+        self.assertEqual(code, 0, said)
+        lost = self.named()[5]
+        self.store.request("DELETE", f"/{BUCKET}/{self.prefix}/{lost}")
+        code, said = self.checked()
+        self.assertEqual(code, 3, said)
+        self.assertRegex(said, f"missing: tile .* of tissue .{lost}.")
 
     def test_killed_while_it_writes(self):
         random.seed(SEED)

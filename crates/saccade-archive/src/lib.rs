@@ -19,7 +19,7 @@
 //! # Failure
 //!
 //! Files are believed nothing: whatever is in them ends in a typed error, never a panic. Errors
-//! tell what may succeed later (`is_transient`) from what will not.
+//! tell what may succeed later (`is_transient`) from what will not. [`check`] looks at a whole archive.
 //!
 //! The order of a tile's steps makes crashes harmless: its pyramid is written under a temporary
 //! name, synced, renamed, and the folder synced; only then does one transaction name it in the
@@ -33,6 +33,7 @@
 
 pub mod acquisition;
 pub mod catalog;
+pub mod check;
 pub mod image;
 pub mod pyramid;
 pub mod storage;

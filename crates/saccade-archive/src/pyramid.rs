@@ -24,7 +24,7 @@
 //! # Checksums
 //!
 //! Each sub-tile's bytes and the description have a CRC-32. Reading a sub-tile does not compute it;
-//! [`verify`] does, of a whole file. Files from before there were checksums are read as well.
+//! [`verify`] does, of a whole file, which also knows the name of its object ([`named`]). Files from before there were checksums are read as well.
 //!
 //! # Failure
 //!
@@ -51,7 +51,7 @@ mod voxel;
 pub use encode::{encode, encode_labels};
 pub use error::{EncodeError, PyramidError};
 pub use index::{PyramidIndex, SubTileRead};
-pub use verify::{Verified, verify, verify_quickly};
+pub use verify::{Verified, named, verify, verify_quickly};
 pub use voxel::Voxel;
 
 /// Edge of a sub-tile \[pixels\].

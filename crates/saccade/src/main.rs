@@ -36,6 +36,7 @@ enum Command {
     Serve(commands::serve::Serve),
     View(commands::view::View),
     Render(commands::render::Render),
+    Check(commands::check::Check),
 }
 
 fn main() -> ExitCode {
@@ -50,20 +51,22 @@ fn main() -> ExitCode {
         Ok(runtime) => runtime,
         Err(error) => return report::failed(&error.into()),
     };
-    let done = runtime.block_on(async {
+    let ended = runtime.block_on(async {
+        let done = |done: anyhow::Result<()>| done.map(|()| ExitCode::SUCCESS);
         match command {
-            Command::Demo(demo) => demo.run().await,
-            Command::Simulate(simulate) => simulate.run().await,
-            Command::Ingest(ingest) => ingest.run().await,
-            Command::Serve(serve) => serve.run().await,
-            Command::View(view) => view.run().await,
-            Command::Render(render) => render.run().await,
+            Command::Demo(demo) => done(demo.run().await),
+            Command::Simulate(simulate) => done(simulate.run().await),
+            Command::Ingest(ingest) => done(ingest.run().await),
+            Command::Serve(serve) => done(serve.run().await),
+            Command::View(view) => done(view.run().await),
+            Command::Render(render) => done(render.run().await),
+            Command::Check(check) => check.run().await,
         }
     });
     // Work on other threads that nobody waits for any more must not keep the program alive.
     runtime.shutdown_background();
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
+    match ended {
+        Ok(code) => code,
         Err(error) => report::failed(&error),
     }
 }

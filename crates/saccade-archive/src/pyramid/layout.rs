@@ -8,7 +8,7 @@ use bytes::Bytes;
 use glam::UVec2;
 use saccade_core::volume::Dtype;
 
-use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry};
+use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry, parse};
 
 pub(super) const NEW_SUBFILE_TYPE: u16 = 254;
 pub(super) const IMAGE_WIDTH: u16 = 256;
@@ -32,8 +32,11 @@ pub(super) const INDEX_LEN: u16 = 65_000;
 pub(super) const SUB_TILE_STATS: u16 = 65_001;
 /// Private: CRC-32 of each sub-tile's bytes, in the order of the offsets.
 pub(super) const SUB_TILE_CHECKSUMS: u16 = 65_002;
+/// Private: CRC-32 of the name of the object that the file was made for; 0 if that is not known. The
+/// last tag of its directory but one.
+pub(super) const NAME_CHECKSUM: u16 = 65_003;
 /// Private: CRC-32 of the [`INDEX_LEN`] bytes, this value taken as 0. The last tag of its directory.
-pub(super) const INDEX_CHECKSUM: u16 = 65_003;
+pub(super) const INDEX_CHECKSUM: u16 = 65_004;
 
 pub(super) const COMPRESSION_JPEG: u16 = 7;
 pub(super) const COMPRESSION_DEFLATE: u16 = 8;
@@ -151,8 +154,8 @@ impl Parts {
         let begin = writer.describe(0).len();
         let mut file = writer.describe(begin as u64);
         let checksum = crc32fast::hash(&file).to_le_bytes();
-        let at = writer.index_checksum_at();
-        file[at..at + 4].copy_from_slice(&checksum);
+        let sealed = parse::last_values(&file).expect("a description that was just written");
+        file[sealed.index].copy_from_slice(&checksum);
         file.reserve_exact(self.data_len());
         file.extend_from_slice(&self.blank);
         for level in self.coded.iter().rev() {
@@ -187,7 +190,7 @@ impl Writer<'_> {
         } else {
             file.extend_from_slice(&[42, 0]);
         }
-        let first = self.first() as u64;
+        let first = if self.big { 16 } else { 8 };
         file.extend(self.offset(first));
         // Directories are written one after another; the first names where the others begin.
         let mut at = data + self.parts.blank.len() as u64;
@@ -209,19 +212,6 @@ impl Writer<'_> {
             self.directory(&fields(level, &[]), &mut file);
         }
         file
-    }
-
-    /// Where the first directory begins.
-    fn first(&self) -> usize {
-        if self.big { 16 } else { 8 }
-    }
-
-    /// Where the value of [`INDEX_CHECKSUM`] is, in the last entry of the first directory.
-    fn index_checksum_at(&self) -> usize {
-        let (count_len, entry_len, value_at) = if self.big { (8, 20, 12) } else { (2, 12, 8) };
-        let sub_ifds = vec![0; self.parts.levels.len() - 1];
-        let entries = self.fields(0, 0, 0, &sub_ifds).len();
-        self.first() + count_len + entry_len * (entries - 1) + value_at
     }
 
     /// A level's tags, in order. Its data begins at `begin`; the index, and the blank sub-tile's
@@ -321,6 +311,7 @@ impl Writer<'_> {
             value: checksums,
         });
         if level == 0 {
+            fields.push(Field::long(NAME_CHECKSUM, 0));
             fields.push(Field::long(INDEX_CHECKSUM, 0));
         }
         fields

@@ -1,10 +1,12 @@
 //! A pyramid's description, read from bytes that may hold anything.
 
+use std::ops::Range;
+
 use saccade_core::volume::Dtype;
 
 use super::layout::{
     BITS_PER_SAMPLE, BYTE, COMPRESSION, COMPRESSION_DEFLATE, COMPRESSION_JPEG, IMAGE_LENGTH,
-    IMAGE_WIDTH, INDEX_CHECKSUM, INDEX_LEN, JPEG_TABLES, LONG, LONG8, PREDICTOR,
+    IMAGE_WIDTH, INDEX_CHECKSUM, INDEX_LEN, JPEG_TABLES, LONG, LONG8, NAME_CHECKSUM, PREDICTOR,
     PREDICTOR_HORIZONTAL, SHORT, SUB_IFDS, SUB_TILE_CHECKSUMS, SUB_TILE_STATS, TILE_BYTE_COUNTS,
     TILE_LENGTH, TILE_OFFSETS, TILE_WIDTH, UNDEFINED, bits_of, stats_kind,
 };
@@ -129,17 +131,7 @@ pub(super) fn checksums(bytes: &[u8], levels: usize) -> Result<Option<Vec<Vec<u3
         return Ok(None);
     }
     let want = first.one(INDEX_CHECKSUM)?;
-    // It is the last entry's value.
-    let (count_len, entry_len, value_at) = if file.big { (8, 20, 12) } else { (2, 12, 8) };
-    let entries = file.number(file.first, count_len)?;
-    let at = file.first + count_len as u64 + entry_len * entries.saturating_sub(1) + value_at;
-    file.slice(at, 4)?;
-    let at = usize::try_from(at).map_err(|_| "its index has no end")?;
-    let mut hasher = crc32fast::Hasher::new();
-    hasher.update(&bytes[..at]);
-    hasher.update(&[0; 4]);
-    hasher.update(&bytes[at + 4..]);
-    if u64::from(hasher.finalize()) != want {
+    if u64::from(checksum(bytes, &last_values(bytes)?)) != want {
         return Err("its index does not have its checksum".to_owned());
     }
     let sub_ifds = if levels > 1 {
@@ -155,6 +147,49 @@ pub(super) fn checksums(bytes: &[u8], levels: usize) -> Result<Option<Vec<Vec<u3
         Ok(checksums.map(|c| u32::from_le_bytes(*c)).collect())
     });
     Ok(Some(checksums.collect::<Result<_, Reason>>()?))
+}
+
+/// Where the values of a description's last tags are.
+pub(super) struct LastValues {
+    /// Of `NAME_CHECKSUM`.
+    pub(super) name: Range<usize>,
+    /// Of `INDEX_CHECKSUM`.
+    pub(super) index: Range<usize>,
+}
+
+pub(super) fn last_values(bytes: &[u8]) -> Result<LastValues, Reason> {
+    let file = File::new(bytes)?;
+    let (count_len, entry_len, value_at) = if file.big { (8, 20, 12) } else { (2, 12, 8) };
+    let entries = file.number(file.first, count_len)?;
+    let value = |back: u64| {
+        let entry = entries
+            .checked_sub(back)
+            .ok_or("a directory is too short")?;
+        let at = file.first + count_len as u64 + entry_len * entry + value_at;
+        file.slice(at, 4)?;
+        let at = usize::try_from(at).map_err(|_| "its index has no end")?;
+        Ok::<_, Reason>(at..at + 4)
+    };
+    Ok(LastValues {
+        name: value(2)?,
+        index: value(1)?,
+    })
+}
+
+/// The checksum of a description.
+pub(super) fn checksum(index: &[u8], values: &LastValues) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(&index[..values.index.start]);
+    hasher.update(&[0; 4]);
+    hasher.update(&index[values.index.end..]);
+    hasher.finalize()
+}
+
+/// Checksum of the name of the object that a file was made for.
+pub(super) fn name_checksum(bytes: &[u8]) -> Option<u32> {
+    let file = File::new(bytes).ok()?;
+    let value = file.directory(file.first).ok()?.one(NAME_CHECKSUM).ok()?;
+    u32::try_from(value).ok().filter(|value| *value != 0)
 }
 
 fn entries(

@@ -1,4 +1,4 @@
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 
 use super::{PyramidError, PyramidIndex, SUB_TILE_VOXELS, parse};
 use crate::storage::Storage;
@@ -10,6 +10,39 @@ pub struct Verified {
     pub index: PyramidIndex,
     /// Whether the file has checksums; older ones have none, and their voxels were only decoded.
     pub checksums: bool,
+    /// Whether it was made for an object of another name: see [`named`].
+    pub mistaken: bool,
+}
+
+/// Notes in a pyramid's bytes the name of the object they are for, so that [`verify`] can tell one
+/// tile's from another's.
+///
+/// # Errors
+///
+/// [`PyramidError::Broken`] if they are no pyramid's.
+pub fn named(file: Bytes, name: &str) -> Result<Bytes, PyramidError> {
+    let broken = |reason| PyramidError::Broken {
+        reason,
+        name: name.to_owned(),
+    };
+    let len = parse::index_len(&file).map_err(broken)?;
+    let len = usize::try_from(len).ok().filter(|len| *len <= file.len());
+    let len = len.ok_or_else(|| broken("it ends within its index".to_owned()))?;
+    let values = parse::last_values(&file).map_err(broken)?;
+    // Nobody else has them, so nothing is copied.
+    let mut file = file
+        .try_into_mut()
+        .unwrap_or_else(|file| BytesMut::from(&*file));
+    let own = crc32fast::hash(name.as_bytes()).to_le_bytes();
+    file[values.name.clone()].copy_from_slice(&own);
+    let checksum = parse::checksum(&file[..len], &values).to_le_bytes();
+    file[values.index].copy_from_slice(&checksum);
+    Ok(file.freeze())
+}
+
+fn is_mistaken(index: &[u8], name: &str) -> bool {
+    let own = parse::name_checksum(index);
+    own.is_some_and(|own| own != crc32fast::hash(name.as_bytes()))
 }
 
 /// Reads a pyramid to its last byte: description and every sub-tile, each held against its checksum
@@ -62,6 +95,7 @@ pub fn verify(bytes: &[u8], name: &str) -> Result<Verified, PyramidError> {
     Ok(Verified {
         index,
         checksums: checksums.is_some(),
+        mistaken: is_mistaken(head, name),
     })
 }
 
@@ -87,6 +121,7 @@ pub async fn verify_quickly(storage: &dyn Storage, name: &str) -> Result<Verifie
     Ok(Verified {
         index,
         checksums: checksums.is_some(),
+        mistaken: is_mistaken(&head, name),
     })
 }
 
@@ -148,6 +183,16 @@ mod tests {
             let longer = [&whole[..], &[0]].concat();
             assert!(verify(&longer, "longer").is_err());
         }
+    }
+
+    #[test]
+    fn pyramids_know_for_whom_they_are() {
+        let nameless = file(Encoding::Lossless);
+        assert!(!verify(&nameless, "a").unwrap().mistaken);
+        let named = named(nameless.into(), "a").unwrap();
+        assert!(!verify(&named, "a").unwrap().mistaken);
+        assert!(verify(&named, "b").unwrap().mistaken);
+        assert!(super::named(Bytes::from_static(b"II*"), "a").is_err());
     }
 
     #[tokio::test]

@@ -203,6 +203,10 @@ impl Context<'_> {
                 return Ok(quarantine(&record, reason, bytes, Some(name)));
             }
         };
+        let pyramid = match pyramid::named(pyramid, &name) {
+            Ok(pyramid) => pyramid,
+            Err(e) => return Ok(quarantine(&record, e.to_string(), bytes, Some(name))),
+        };
         self.write(&record.tile, &name, pyramid).await?;
         let pixels = u64::from(size.x) * u64::from(size.y);
         let tile = NewTile {

@@ -6,6 +6,7 @@ mod crashes;
 mod faults;
 mod kill;
 mod kinds;
+mod mended;
 mod quarantine;
 mod scope;
 mod stream;

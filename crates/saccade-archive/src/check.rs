@@ -1,0 +1,443 @@
+//! Whether an archive is whole: what the catalog names against what the storage holds.
+//!
+//! Objects are listed first and the catalog is read afterwards, so that a running ingest disturbs
+//! nothing: what it enters meanwhile is named by then, and what it is about to enter is young.
+
+use std::collections::{BTreeMap, HashSet};
+use std::hash::{BuildHasher, RandomState};
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use futures::{StreamExt as _, stream};
+use serde::Serialize;
+
+use crate::VisualizationArchive;
+use crate::acquisition::{Cursor, Record, RecordReader, TileRecord, image_path};
+use crate::catalog::{CatalogError, Quarantined, Tile, VolumeEntry, Waiting, place};
+use crate::pyramid::{self, PyramidError, Verified};
+use crate::storage::{Entry, StorageError};
+
+#[cfg(test)]
+mod tests;
+
+/// What to look at, and what to do about it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CheckOptions {
+    /// Look at descriptions and lengths only, and read no voxels.
+    pub quick: bool,
+    /// Mend what can be: see [`check`].
+    pub repair: bool,
+    /// The acquisition archive whose records say how to make damaged pyramids anew.
+    pub acquisition: Option<PathBuf>,
+    /// Objects that nobody names may be about to be entered until they are so old.
+    pub safe_age: Duration,
+    /// Tiles in work at once. Each holds its pyramid in memory.
+    pub workers: usize,
+}
+
+impl Default for CheckOptions {
+    fn default() -> Self {
+        Self {
+            quick: false,
+            repair: false,
+            acquisition: None,
+            safe_age: Duration::from_secs(3600),
+            workers: 4,
+        }
+    }
+}
+
+/// What was looked at, and what was found.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct CheckReport {
+    /// Tiles that the catalog names.
+    pub tiles: u64,
+    /// Their pyramids' size \[bytes\]; of quick checks, what the storage says.
+    pub bytes: u64,
+    /// Pyramids without checksums, which older versions wrote.
+    pub without_checksums: u64,
+    /// Replaced pyramids that wait for their deletion.
+    pub retired: u64,
+    /// Unnamed objects that are too young to be called orphans.
+    pub young: u64,
+    /// What is not as it should be.
+    pub findings: Vec<Finding>,
+}
+
+/// Something that is not as it should be.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// What it is.
+    pub kind: FindingKind,
+    /// The volume, if it belongs to one.
+    pub volume: Option<String>,
+    /// The tile, if it is one's.
+    pub tile: Option<String>,
+    /// The object in the storage.
+    pub object: Option<String>,
+    /// What is wrong.
+    pub reason: String,
+    /// What was done about it.
+    pub repair: Option<Repair>,
+}
+
+/// What can be wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
+pub enum FindingKind {
+    /// The catalog names a pyramid that is not there.
+    Missing,
+    /// A pyramid is not what was written.
+    Damaged,
+    /// A pyramid is whole, but that of another tile.
+    Mistaken,
+    /// A tile lies where nothing can: numbers that are none, or outside the volume.
+    Misplaced,
+    /// Two tiles name one pyramid.
+    Shared,
+    /// The catalog's counts are not those of its tiles.
+    Miscounted,
+    /// A pyramid that nothing names. Harmless, but it takes space.
+    Orphan,
+}
+
+/// What was done about a finding.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
+pub enum Repair {
+    /// The object is deleted.
+    Deleted,
+    /// The tile's record waits for ingest, which makes the pyramid anew.
+    Queued,
+    /// The tile is in quarantine, for its record or image is not to be had.
+    Quarantined,
+}
+
+impl FindingKind {
+    /// Whether something is lost; else only space is.
+    pub fn is_damage(self) -> bool {
+        self != Self::Orphan
+    }
+}
+
+impl CheckReport {
+    /// Findings that are damage and not on the way to be mended.
+    pub fn damage(&self) -> usize {
+        let damage = self
+            .findings
+            .iter()
+            .filter(|finding| finding.kind.is_damage() && finding.repair != Some(Repair::Queued));
+        damage.count()
+    }
+}
+
+/// Why an archive could not be checked to its end.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CheckError {
+    /// The catalog cannot be used.
+    #[error(transparent)]
+    Catalog(#[from] CatalogError),
+    /// The storage cannot be used at all.
+    #[error("the archive's objects cannot be read")]
+    Storage {
+        /// What went wrong.
+        #[from]
+        source: StorageError,
+    },
+}
+
+/// Checks an archive. `progress` hears how many tiles of how many were looked at.
+///
+/// Each tile's pyramid is read whole and decoded, and held against its checksums, its size, and its
+/// name; transforms and counts of the catalog are looked at, and objects that nothing names are
+/// listed. With [`CheckOptions::repair`], orphans of a safe age are deleted; a tile whose pyramid is
+/// missing or damaged is given back to ingest if the acquisition still has its record and image,
+/// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
+/// damaged object: ingest replaces it.
+///
+/// # Errors
+///
+/// [`CheckError`]: of what made going on pointless, not of a single object.
+pub async fn check(
+    archive: &VisualizationArchive,
+    options: &CheckOptions,
+    progress: &(dyn Fn(u64, u64) + Sync),
+) -> Result<CheckReport, CheckError> {
+    let objects = archive.storage().entries("tiles/").await?;
+    let volumes = archive.catalog().volumes().await?;
+    let total = volumes.iter().map(|v| v.tiles).sum();
+    let mut check = Check {
+        archive,
+        options,
+        progress,
+        total,
+        report: CheckReport::default(),
+        hasher: RandomState::new(),
+        named: HashSet::new(),
+    };
+    for volume in &volumes {
+        check.volume(volume).await?;
+    }
+    check.orphans(&objects).await?;
+    let mut report = check.report;
+    if options.quick {
+        let sizes = objects.iter().map(|object| object.size);
+        report.bytes = sizes.sum();
+    }
+    Ok(report)
+}
+
+struct Check<'a> {
+    archive: &'a VisualizationArchive,
+    options: &'a CheckOptions,
+    progress: &'a (dyn Fn(u64, u64) + Sync),
+    total: u64,
+    report: CheckReport,
+    hasher: RandomState,
+    /// Hashes of the names that the catalog knows: millions of names would take much memory.
+    named: HashSet<u64>,
+}
+
+impl Check<'_> {
+    async fn volume(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
+        let catalog = self.archive.catalog();
+        let volume = &entry.volume;
+        let before = self.report.tiles;
+        for z in catalog.sections(&volume.name).await? {
+            let tiles = catalog.section_tiles(&volume.name, z).await?;
+            let looks = tiles.into_iter().map(async |tile| {
+                let looked = self.look(&tile).await;
+                (tile, looked)
+            });
+            let workers = self.options.workers.max(1);
+            let looks: Vec<_> = stream::iter(looks).buffered(workers).collect().await;
+            for (tile, looked) in looks {
+                self.report.tiles += 1;
+                self.tile(entry, &tile, looked).await?;
+            }
+            (self.progress)(self.report.tiles, self.total);
+        }
+        let tiles = self.report.tiles - before;
+        // Others may have entered some meanwhile: only what cannot be so is wrong.
+        let now = catalog.entry(&volume.name).await?;
+        if !(entry.tiles.min(now.tiles)..=entry.tiles.max(now.tiles)).contains(&tiles) {
+            let reason = format!("the catalog counts {} tiles, but has {tiles}", now.tiles);
+            self.find(FindingKind::Miscounted, entry, None, reason);
+        }
+        let later = SystemTime::now() + Duration::from_secs(1 << 32);
+        for retired in catalog.retired(&volume.name, later, u32::MAX).await? {
+            self.report.retired += 1;
+            self.named.insert(self.hasher.hash_one(&retired.pyramid));
+        }
+        Ok(())
+    }
+
+    /// Looks at a tile's pyramid.
+    async fn look(&self, tile: &Tile) -> Result<(Verified, u64), PyramidError> {
+        let (storage, name) = (self.archive.storage(), tile.pyramid.clone());
+        if self.options.quick {
+            let verified = pyramid::verify_quickly(storage.as_ref(), &name).await?;
+            return Ok((verified, 0));
+        }
+        let read = storage.read(&name, None).await;
+        let bytes: Bytes = read.map_err(|source| PyramidError::Storage {
+            source,
+            name: name.clone(),
+        })?;
+        let len = bytes.len() as u64;
+        let work = tokio::task::spawn_blocking(move || pyramid::verify(&bytes, &name));
+        let verified = work.await.unwrap_or_else(|panicked| {
+            Err(PyramidError::Broken {
+                reason: format!("decoding it failed unexpectedly: {panicked}"),
+                name: tile.pyramid.clone(),
+            })
+        });
+        Ok((verified?, len))
+    }
+
+    async fn tile(
+        &mut self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        looked: Result<(Verified, u64), PyramidError>,
+    ) -> Result<(), CheckError> {
+        let extent = entry.volume.extent();
+        if place(extent, tile.section, tile.size, tile.transform).is_none() {
+            let reason = format!("its transform {:?} is none", tile.transform.elements());
+            self.find(FindingKind::Misplaced, entry, Some(tile), reason);
+        }
+        if !self.named.insert(self.hasher.hash_one(&tile.pyramid)) {
+            let reason = "another tile names the same pyramid".to_owned();
+            self.find(FindingKind::Shared, entry, Some(tile), reason);
+        }
+        let (kind, reason) = match looked {
+            Ok((verified, len)) => {
+                self.report.bytes += len;
+                self.report.without_checksums += u64::from(!verified.checksums);
+                let level = verified.index.levels()[0];
+                if verified.mistaken {
+                    let reason = "the pyramid was made for another tile".to_owned();
+                    return self.mend(FindingKind::Mistaken, entry, tile, reason).await;
+                }
+                if [level.width, level.height] == tile.size.to_array() {
+                    return Ok(());
+                }
+                let reason = format!(
+                    "the pyramid has {} x {} pixels, the tile {} x {}",
+                    level.width, level.height, tile.size.x, tile.size.y
+                );
+                (FindingKind::Mistaken, reason)
+            }
+            Err(PyramidError::Storage {
+                source: StorageError::NotFound { .. },
+                ..
+            }) => (FindingKind::Missing, "the pyramid is not there".to_owned()),
+            Err(PyramidError::Storage { source, .. }) => match source {
+                // One file that the disk cannot read is damaged; a store that is away says nothing.
+                StorageError::Io { source, .. } => {
+                    (FindingKind::Damaged, format!("it cannot be read: {source}"))
+                }
+                other => return Err(other.into()),
+            },
+            Err(PyramidError::Broken { reason, .. }) => (FindingKind::Damaged, reason),
+            Err(other) => (FindingKind::Damaged, other.to_string()),
+        };
+        self.mend(kind, entry, tile, reason).await
+    }
+
+    /// Notes that a tile's pyramid is not right, and repairs it if that is wanted.
+    async fn mend(
+        &mut self,
+        kind: FindingKind,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        reason: String,
+    ) -> Result<(), CheckError> {
+        let repair = if self.options.repair {
+            Some(self.repair(entry, tile, &reason).await?)
+        } else {
+            None
+        };
+        self.find(kind, entry, Some(tile), reason).repair = repair;
+        Ok(())
+    }
+
+    fn find(
+        &mut self,
+        kind: FindingKind,
+        entry: &VolumeEntry,
+        tile: Option<&Tile>,
+        reason: String,
+    ) -> &mut Finding {
+        self.report.findings.push_mut(Finding {
+            kind,
+            volume: Some(entry.volume.name.clone()),
+            tile: tile.map(|tile| tile.name.clone()),
+            object: tile.map(|tile| tile.pyramid.clone()),
+            reason,
+            repair: None,
+        })
+    }
+
+    /// Gives a tile back to ingest, or puts it into quarantine.
+    async fn repair(
+        &self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        reason: &str,
+    ) -> Result<Repair, CheckError> {
+        let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+        let repair = match self.record(tile) {
+            Some((position, record)) => {
+                let reason = format!("its pyramid was found damaged: {reason}");
+                let waiting = Waiting {
+                    position,
+                    record,
+                    reason,
+                };
+                commit.wait(&waiting).await?;
+                Repair::Queued
+            }
+            None => {
+                let what = Quarantined {
+                    file: tile.pyramid.clone(),
+                    tile: Some(tile.name.clone()),
+                    reason: format!(
+                        "the pyramid was found damaged ({reason}); append the tile's record to its \
+                         acquisition once more, and ingest makes it anew"
+                    ),
+                    bytes: None,
+                    at: SystemTime::now(),
+                };
+                commit.quarantine(&what).await?;
+                Repair::Quarantined
+            }
+        };
+        commit.finish().await?;
+        Ok(repair)
+    }
+
+    /// The record that a tile's pyramid was made of, if it and its image are still there.
+    fn record(&self, tile: &Tile) -> Option<(u64, TileRecord)> {
+        let folder = self.options.acquisition.as_ref()?;
+        let offset = position_of(&tile.pyramid)?;
+        let mut reader = RecordReader::new(folder, Cursor { offset, line: 0 });
+        let line = reader.read(1).ok()?.into_iter().next()?;
+        match line.record {
+            Ok(Record::Tile(record)) if record.tile == tile.name && line.offset == offset => {
+                let image = image_path(folder, &record.file)?;
+                image.is_file().then_some((offset, record))
+            }
+            _ => None,
+        }
+    }
+
+    /// Finds what nothing names.
+    async fn orphans(&mut self, objects: &[Entry]) -> Result<(), CheckError> {
+        let now = SystemTime::now();
+        for object in objects {
+            if self.named.contains(&self.hasher.hash_one(&object.name)) {
+                continue;
+            }
+            let age = object.modified.and_then(|at| now.duration_since(at).ok());
+            if age.is_none_or(|age| age < self.options.safe_age) {
+                self.report.young += 1;
+                continue;
+            }
+            let repair = if self.options.repair {
+                self.archive.storage().delete(&object.name).await?;
+                Some(Repair::Deleted)
+            } else {
+                None
+            };
+            self.report.findings.push(Finding {
+                kind: FindingKind::Orphan,
+                volume: None,
+                tile: None,
+                object: Some(object.name.clone()),
+                reason: format!("nothing names these {} bytes", object.size),
+                repair,
+            });
+        }
+        Ok(())
+    }
+}
+
+/// The position of the record that a pyramid was made of: ingest ends names with it.
+fn position_of(pyramid: &str) -> Option<u64> {
+    let stem = pyramid.strip_suffix(".tif")?;
+    u64::from_str_radix(stem.rsplit_once('-')?.1, 16).ok()
+}
+
+/// How many findings there are of each kind.
+pub fn count(findings: &[Finding]) -> BTreeMap<FindingKind, usize> {
+    let mut counts = BTreeMap::new();
+    for finding in findings {
+        *counts.entry(finding.kind).or_default() += 1;
+    }
+    counts
+}

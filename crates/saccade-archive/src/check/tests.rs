@@ -1,0 +1,272 @@
+use std::fs::{self, File};
+use std::path::Path;
+
+use glam::{DVec2, DVec3, UVec2, UVec3};
+use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::Volume;
+
+use super::*;
+use crate::acquisition::{RecordWriter, TileRecord};
+use crate::catalog::NewTile;
+use crate::image::GrayImage;
+use crate::pyramid::{Encoding, encode};
+
+const VOLUME: &str = "v";
+const TILES: u32 = 6;
+
+/// An archive with tiles of two sizes, and the records that they were made of.
+struct Fixture {
+    folder: tempfile::TempDir,
+    acquisition: tempfile::TempDir,
+    archive: VisualizationArchive,
+    names: Vec<String>,
+}
+
+impl Fixture {
+    async fn new() -> Self {
+        let (folder, acquisition) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let archive = VisualizationArchive::create(folder.path()).await.unwrap();
+        let volume = Volume::new(VOLUME, UVec3::new(900, 900, 8), DVec3::ONE).unwrap();
+        archive.catalog().create_volume(&volume).await.unwrap();
+        let mut names = Vec::new();
+        for n in 0..TILES {
+            let size = UVec2::new(200 + 10 * (n % 2), 150);
+            let file = format!("t{n}.tif");
+            File::create(acquisition.path().join(&file)).unwrap();
+            let record = TileRecord {
+                tile: format!("t{n}"),
+                file,
+                section: n / 2,
+                size,
+                transform: SectionFromTile::translation(DVec2::splat(3.0)),
+                channel: None,
+            };
+            let list = acquisition.path().join(RecordReader::FILE);
+            let position = fs::metadata(&list).map_or(0, |m| m.len());
+            let mut writer = RecordWriter::open(acquisition.path()).unwrap();
+            writer.append(&Record::Tile(record.clone())).unwrap();
+            let object = format!("tiles/v/{:06}/t{n}-{position:x}.tif", record.section);
+            let value = |at: u32| u8::try_from((at * 7 + at / 13 + n * 31) % 251).unwrap() + 1;
+            let image = GrayImage {
+                width: size.x,
+                height: size.y,
+                voxels: (0..size.x * size.y).map(value).collect(),
+            };
+            let bytes = encode(&image, &Encoding::Lossless).unwrap();
+            let bytes = pyramid::named(bytes, &object).unwrap();
+            let written = archive.storage().write_durable(&object, bytes).await;
+            written.unwrap();
+            let tile = NewTile {
+                name: record.tile,
+                section: record.section,
+                channel: 0,
+                size,
+                transform: record.transform,
+                pyramid: object.clone(),
+                position,
+            };
+            archive.catalog().commit_tile(VOLUME, &tile).await.unwrap();
+            names.push(object);
+        }
+        Self {
+            folder,
+            acquisition,
+            archive,
+            names,
+        }
+    }
+
+    fn path(&self, n: usize) -> PathBuf {
+        self.folder.path().join(&self.names[n])
+    }
+
+    async fn check(&self, quick: bool) -> CheckReport {
+        let options = CheckOptions {
+            quick,
+            safe_age: Duration::ZERO,
+            ..CheckOptions::default()
+        };
+        check(&self.archive, &options, &|_, _| {}).await.unwrap()
+    }
+}
+
+/// Kinds and tiles of what was found.
+fn found(report: &CheckReport) -> Vec<(FindingKind, &str)> {
+    let all = report.findings.iter().map(|finding| {
+        let name = finding.tile.as_deref().or(finding.object.as_deref());
+        (finding.kind, name.unwrap_or_default())
+    });
+    all.collect()
+}
+
+#[tokio::test]
+async fn a_whole_archive_is_whole() {
+    let fixture = Fixture::new().await;
+    for quick in [true, false] {
+        let report = fixture.check(quick).await;
+        assert_eq!(report.findings, []);
+        assert_eq!((report.tiles, report.damage()), (TILES.into(), 0));
+        assert_eq!(report.without_checksums, 0);
+        let sizes = (0..6).map(|n| fs::metadata(fixture.path(n)).unwrap().len());
+        assert_eq!(report.bytes, sizes.sum::<u64>());
+    }
+}
+
+#[tokio::test]
+async fn every_damage_is_found_and_named() {
+    type Damage = fn(&Fixture);
+    /// What, how, whether a quick look finds it, and as what.
+    type Case<'a> = (&'a str, Damage, bool, &'a [(FindingKind, &'a str)]);
+    fn change(path: &Path, change: impl FnOnce(&mut Vec<u8>)) {
+        let mut bytes = fs::read(path).unwrap();
+        change(&mut bytes);
+        fs::write(path, bytes).unwrap();
+    }
+    let kinds: [Case<'_>; 10] = [
+        (
+            "gone",
+            |f| fs::remove_file(f.path(2)).unwrap(),
+            true,
+            &[(FindingKind::Missing, "t2")],
+        ),
+        (
+            "cut",
+            |f| change(&f.path(1), |b| b.truncate(b.len() - 1)),
+            true,
+            &[(FindingKind::Damaged, "t1")],
+        ),
+        (
+            "emptied",
+            |f| change(&f.path(1), Vec::clear),
+            true,
+            &[(FindingKind::Damaged, "t1")],
+        ),
+        (
+            "grown",
+            |f| change(&f.path(1), |b| b.push(0)),
+            true,
+            &[(FindingKind::Damaged, "t1")],
+        ),
+        (
+            "a bit of its last sub-tile",
+            |f| {
+                change(&f.path(5), |b| {
+                    let at = b.len() - 9;
+                    b[at] ^= 4;
+                });
+            },
+            false,
+            &[(FindingKind::Damaged, "t5")],
+        ),
+        (
+            "a bit of its description",
+            |f| change(&f.path(5), |b| b[150] ^= 1),
+            true,
+            &[(FindingKind::Damaged, "t5")],
+        ),
+        (
+            "overwritten",
+            |f| change(&f.path(0), |b| b.fill(0)),
+            true,
+            &[(FindingKind::Damaged, "t0")],
+        ),
+        (
+            "swapped",
+            |f| {
+                let (a, b) = (fs::read(f.path(0)).unwrap(), fs::read(f.path(1)).unwrap());
+                fs::write(f.path(0), b).unwrap();
+                fs::write(f.path(1), a).unwrap();
+            },
+            true,
+            &[(FindingKind::Mistaken, "t0"), (FindingKind::Mistaken, "t1")],
+        ),
+        (
+            "swapped with one of its size",
+            |f| {
+                let (a, b) = (fs::read(f.path(0)).unwrap(), fs::read(f.path(2)).unwrap());
+                fs::write(f.path(0), b).unwrap();
+                fs::write(f.path(2), a).unwrap();
+            },
+            true,
+            &[(FindingKind::Mistaken, "t0"), (FindingKind::Mistaken, "t2")],
+        ),
+        (
+            "one that nobody names",
+            |f| fs::write(f.folder.path().join("tiles/v/stray.tif"), "stray").unwrap(),
+            true,
+            &[(FindingKind::Orphan, "tiles/v/stray.tif")],
+        ),
+    ];
+    for (what, damage, quickly, want) in kinds {
+        let fixture = Fixture::new().await;
+        damage(&fixture);
+        let report = fixture.check(false).await;
+        assert_eq!(found(&report), want, "{what}");
+        let lost = want.iter().filter(|(kind, _)| kind.is_damage()).count();
+        assert_eq!(report.damage(), lost, "{what}");
+        let quick = fixture.check(true).await;
+        assert_eq!(
+            found(&quick),
+            if quickly { want } else { &[] },
+            "{what}, quickly"
+        );
+    }
+}
+
+#[tokio::test]
+async fn young_objects_may_be_about_to_be_entered() {
+    let fixture = Fixture::new().await;
+    fs::write(fixture.folder.path().join("tiles/v/young.tif"), "young").unwrap();
+    let options = CheckOptions {
+        repair: true,
+        ..CheckOptions::default()
+    };
+    let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+    assert_eq!((report.young, report.findings.len()), (1, 0));
+    assert!(fixture.folder.path().join("tiles/v/young.tif").exists());
+}
+
+#[tokio::test]
+async fn repairs_touch_nothing_that_is_whole() {
+    let fixture = Fixture::new().await;
+    let stray = fixture.folder.path().join("tiles/v/stray.tif");
+    fs::write(&stray, "stray").unwrap();
+    fs::write(fixture.path(1), "damaged").unwrap();
+    fs::remove_file(fixture.path(4)).unwrap();
+    // The image of the second is gone, too.
+    fs::remove_file(fixture.acquisition.path().join("t4.tif")).unwrap();
+    let whole: Vec<_> = [0, 2, 3, 5]
+        .map(|n| fs::read(fixture.path(n)).unwrap())
+        .into();
+    let options = CheckOptions {
+        repair: true,
+        acquisition: Some(fixture.acquisition.path().to_owned()),
+        safe_age: Duration::ZERO,
+        ..CheckOptions::default()
+    };
+    let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+    let repairs: Vec<_> = report.findings.iter().map(|f| (f.kind, f.repair)).collect();
+    assert_eq!(
+        repairs,
+        [
+            (FindingKind::Damaged, Some(Repair::Queued)),
+            (FindingKind::Missing, Some(Repair::Quarantined)),
+            (FindingKind::Orphan, Some(Repair::Deleted)),
+        ]
+    );
+    assert_eq!(report.damage(), 1, "what is in quarantine is not mended");
+    assert!(!stray.exists());
+    let after: Vec<_> = [0, 2, 3, 5]
+        .map(|n| fs::read(fixture.path(n)).unwrap())
+        .into();
+    assert_eq!(after, whole);
+    let waiting = fixture.archive.catalog().waiting(VOLUME).await.unwrap();
+    assert_eq!(waiting.len(), 1);
+    assert_eq!(waiting[0].record.tile, "t1");
+    let set_aside = fixture.archive.catalog().quarantined(VOLUME).await.unwrap();
+    assert_eq!(set_aside[0].tile.as_deref(), Some("t4"));
+    assert_eq!(
+        fixture.archive.catalog().entry(VOLUME).await.unwrap().tiles,
+        6
+    );
+}

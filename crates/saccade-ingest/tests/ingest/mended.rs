@@ -1,0 +1,45 @@
+//! What a check gives back to ingest is made anew.
+
+use std::fs;
+use std::time::Duration;
+
+use glam::UVec2;
+use saccade_archive::check::{CheckOptions, Repair, check};
+
+use crate::scope::{Scope, VOLUME, archive, pixels, seen, texture};
+
+const SIZE: UVec2 = UVec2::new(140, 130);
+
+#[tokio::test]
+async fn damaged_tiles_are_made_anew() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    for n in 0..4u8 {
+        scope.tile(&format!("t{n}"), u32::from(n), SIZE, n);
+    }
+    let archive = archive(folder.path()).await;
+    scope.ingest(&archive).await;
+    let whole = seen(&archive).await;
+    let path = |n: &str| folder.path().join(&whole[n].pyramid);
+    fs::write(path("t1"), "damaged").unwrap();
+    fs::remove_file(path("t3")).unwrap();
+    fs::copy(path("t0"), path("t2")).unwrap();
+
+    let options = CheckOptions {
+        repair: true,
+        acquisition: Some(scope.path().to_owned()),
+        safe_age: Duration::ZERO,
+        ..CheckOptions::default()
+    };
+    let report = check(&archive, &options, &|_, _| {}).await.unwrap();
+    let repairs: Vec<_> = report.findings.iter().map(|f| f.repair).collect();
+    assert_eq!(repairs, [Some(Repair::Queued); 3], "{:?}", report.findings);
+    assert_eq!(report.damage(), 0);
+    assert_eq!(scope.ingest(&archive).await.tiles, 3);
+
+    let report = check(&archive, &options, &|_, _| {}).await.unwrap();
+    assert_eq!(report.findings, []);
+    let mended = seen(&archive).await;
+    assert_eq!(mended, whole);
+    assert_eq!(pixels(&archive, &mended["t2"]).await, texture(SIZE, 2));
+    assert!(archive.catalog().waiting(VOLUME).await.unwrap().is_empty());
+}

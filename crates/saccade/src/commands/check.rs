@@ -1,0 +1,136 @@
+//! `saccade check`: whether an archive is whole.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+use indicatif::ProgressBar;
+use saccade_archive::VisualizationArchive;
+use saccade_archive::check::{
+    CheckOptions, CheckReport, Finding, FindingKind, Repair, check, count,
+};
+
+use crate::arguments::Archive;
+use crate::report::{say, tell};
+
+/// What the command ends with when tiles are damaged.
+const DAMAGE: u8 = 3;
+
+/// Check that every tile of an archive is there and whole. Ends with 0 if so, with 3 if not.
+#[derive(Args)]
+pub(crate) struct Check {
+    #[command(flatten)]
+    archive: Archive,
+
+    /// Look at descriptions and lengths only, and read no voxels [default: read all]
+    #[arg(long)]
+    quick: bool,
+
+    /// Delete pyramids that nothing has named for an hour; give damaged tiles back to `saccade
+    /// ingest`, or set them aside if --acquisition does not help [default: change nothing]
+    #[arg(long)]
+    repair: bool,
+
+    /// Folder that the microscope wrote to, from which damaged tiles can be made anew [default: none]
+    #[arg(long, value_name = "FOLDER", requires = "repair")]
+    acquisition: Option<PathBuf>,
+
+    /// Print the report as JSON [default: as text]
+    #[arg(long)]
+    json: bool,
+}
+
+impl Check {
+    pub(crate) async fn run(self) -> Result<ExitCode> {
+        let location = self.archive.location()?;
+        let archive = VisualizationArchive::open(&location).await?;
+        let options = CheckOptions {
+            quick: self.quick,
+            repair: self.repair,
+            acquisition: self.acquisition,
+            ..CheckOptions::default()
+        };
+        // Draws nothing where there is no terminal.
+        let bar = ProgressBar::new(0);
+        let done = check(&archive, &options, &|done, total| {
+            bar.set_length(total);
+            bar.set_position(done);
+        })
+        .await;
+        bar.finish_and_clear();
+        let report = done?;
+        archive.catalog().close().await;
+        if self.json {
+            tell(&serde_json::to_string_pretty(&report)?);
+        } else {
+            for finding in &report.findings {
+                tell(&line(finding));
+            }
+        }
+        say(&format!("{}: {location}", summary(&report)));
+        Ok(if report.damage() > 0 {
+            ExitCode::from(DAMAGE)
+        } else {
+            ExitCode::SUCCESS
+        })
+    }
+}
+
+fn name(kind: FindingKind) -> &'static str {
+    match kind {
+        FindingKind::Missing => "missing",
+        FindingKind::Damaged => "damaged",
+        FindingKind::Mistaken => "mistaken",
+        FindingKind::Misplaced => "misplaced",
+        FindingKind::Shared => "shared",
+        FindingKind::Miscounted => "miscounted",
+        FindingKind::Orphan => "orphan",
+        _ => "wrong",
+    }
+}
+
+fn line(finding: &Finding) -> String {
+    let mut line = format!("{}:", name(finding.kind));
+    if let Some(tile) = &finding.tile {
+        line.push_str(&format!(" tile {tile}"));
+    }
+    if let Some(volume) = &finding.volume {
+        line.push_str(&format!(" of {volume}"));
+    }
+    if let Some(object) = &finding.object {
+        line.push_str(&format!(" ({object})"));
+    }
+    line.push_str(&format!(": {}", finding.reason));
+    line.push_str(match finding.repair {
+        Some(Repair::Deleted) => "; deleted",
+        Some(Repair::Queued) => "; `saccade ingest` makes it anew",
+        Some(Repair::Quarantined) => "; set aside: append its record once more",
+        _ => "",
+    });
+    line
+}
+
+fn summary(report: &CheckReport) -> String {
+    let mut parts = vec![format!(
+        "{} tiles, {} MB",
+        report.tiles,
+        report.bytes / 1_000_000
+    )];
+    for (kind, found) in count(&report.findings) {
+        parts.push(format!("{found} {}", name(kind)));
+    }
+    if report.findings.is_empty() {
+        parts.push("all whole".to_owned());
+    }
+    if report.retired > 0 {
+        parts.push(format!("{} replaced and soon deleted", report.retired));
+    }
+    if report.young > 0 {
+        parts.push(format!("{} not entered yet", report.young));
+    }
+    if report.without_checksums > 0 {
+        parts.push(format!("{} without checksums", report.without_checksums));
+    }
+    parts.join(", ")
+}
