@@ -23,7 +23,16 @@ pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
         source,
         path: path.to_owned(),
     })?;
-    let text = String::from_utf8_lossy(&bytes);
+    parse(&bytes, path)
+}
+
+/// The same from the file's bytes; `path` is for messages.
+///
+/// # Errors
+///
+/// As [`read`], but for reading.
+pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
+    let text = String::from_utf8_lossy(bytes);
     let (mut dimensions, mut tiles, mut last) = (None, Vec::new(), 0);
     let wrong = |line, reason| AcquisitionError::Line {
         line,

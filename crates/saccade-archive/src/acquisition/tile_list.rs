@@ -45,14 +45,23 @@ pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
         source,
         path: path.to_owned(),
     })?;
-    let text = String::from_utf8_lossy(&bytes);
+    parse(&bytes, path)
+}
+
+/// The same from the file's bytes; `path` is for messages.
+///
+/// # Errors
+///
+/// As [`read`], but for reading.
+pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
+    let text = String::from_utf8_lossy(bytes);
     let mut tiles = Vec::new();
     for (line, text) in (1..).zip(text.lines()) {
         let text = text.trim();
         if text.is_empty() || text.starts_with('#') {
             continue;
         }
-        tiles.push(parse(text).map_err(|reason| AcquisitionError::Line {
+        tiles.push(listed(text).map_err(|reason| AcquisitionError::Line {
             line,
             reason,
             path: path.to_owned(),
@@ -61,7 +70,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
     Ok(tiles)
 }
 
-fn parse(text: &str) -> Result<ListedTile, String> {
+fn listed(text: &str) -> Result<ListedTile, String> {
     let mut file = text;
     let mut column = || {
         let (rest, last) = file

@@ -93,8 +93,17 @@ pub fn read(path: &Path) -> Result<Vec<TileSpec>, AcquisitionError> {
         source,
         path: path.to_owned(),
     })?;
+    parse(&bytes, path)
+}
+
+/// The same from the file's bytes; `path` is for messages.
+///
+/// # Errors
+///
+/// As [`read`], but for reading.
+pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<TileSpec>, AcquisitionError> {
     let specs: Vec<Json> =
-        serde_json::from_slice(&bytes).map_err(|source| AcquisitionError::Json {
+        serde_json::from_slice(bytes).map_err(|source| AcquisitionError::Json {
             source,
             path: path.to_owned(),
         })?;

@@ -1,5 +1,6 @@
 //! TrakEM2 projects: the affine transform of every patch.
 
+use std::borrow::Cow;
 use std::fs;
 use std::path::Path;
 
@@ -44,9 +45,20 @@ pub fn read(path: &Path) -> Result<Vec<Patch>, AcquisitionError> {
         source,
         path: path.to_owned(),
     })?;
+    parse(&bytes, path)
+}
+
+/// The same from the file's bytes; `path` is for messages.
+///
+/// # Errors
+///
+/// As [`read`], but for reading.
+pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<Patch>, AcquisitionError> {
     // TrakEM2 writes ISO 8859-1; what is not ASCII there can only be part of a name.
-    let text = String::from_utf8(bytes)
-        .unwrap_or_else(|e| e.into_bytes().into_iter().map(char::from).collect());
+    let text = match std::str::from_utf8(bytes) {
+        Ok(text) => Cow::Borrowed(text),
+        Err(_) => bytes.iter().copied().map(char::from).collect(),
+    };
     let options = ParsingOptions {
         allow_dtd: true,
         ..ParsingOptions::default()
