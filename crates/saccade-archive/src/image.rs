@@ -298,6 +298,35 @@ pub fn decode_as(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     }
 }
 
+/// Width and height of an image \[pixels\], from its beginning; of a TIFF from its first directory.
+///
+/// # Errors
+///
+/// [`ImageError`].
+pub fn read_size(path: &Path) -> Result<[u32; 2], ImageError> {
+    /// Bytes that a JPEG's frame may be away from the beginning: comments and profiles come first.
+    const HEADER: u64 = 1 << 20;
+    let failed = |source| ImageError::Read {
+        source,
+        path: path.to_owned(),
+    };
+    let mut file = File::open(path).map_err(failed)?;
+    let mut head = Vec::new();
+    let mut start = file.by_ref().take(sniff::HEAD);
+    start.read_to_end(&mut head).map_err(failed)?;
+    let kind = sniff::kind(&head)?;
+    if kind == Kind::Tiff {
+        file.rewind().map_err(failed)?;
+        return tiff::size(BufReader::new(file));
+    }
+    file.take(HEADER).read_to_end(&mut head).map_err(failed)?;
+    if kind == Kind::Png {
+        png::size(&head)
+    } else {
+        jpeg::size(&head)
+    }
+}
+
 /// Reads and decodes a file to grey of 8 bits.
 ///
 /// # Errors

@@ -24,6 +24,8 @@ pub mod ingest;
 mod progress;
 pub mod replay;
 pub mod simulate;
+#[cfg(unix)]
+pub mod watch;
 
 pub use cancel::Cancel;
 pub use progress::{Meter, Progress, State};

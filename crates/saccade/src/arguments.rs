@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use glam::{DVec3, UVec2, UVec3};
+use glam::{DVec2, DVec3, UVec2, UVec3};
 use saccade_archive::{ArchiveLocation, CatalogLocation, LocationError, StorageLocation};
 use saccade_core::volume::check_name;
 
@@ -70,6 +70,25 @@ pub(crate) fn voxel_nm(text: &str) -> Result<DVec3, String> {
     sensible
         .then_some(nm)
         .ok_or_else(|| "voxel sizes must be above 0".into())
+}
+
+/// Distances above 0, as `x,y`.
+pub(crate) fn pitch(text: &str) -> Result<DVec2, String> {
+    let [x, y] = numbers(text, ',').ok_or("give two numbers of voxels as x,y")?;
+    let pitch = DVec2::new(x, y);
+    let sensible = pitch.is_finite() && pitch.min_element() > 0.0 && pitch.max_element() <= 1e6;
+    sensible
+        .then_some(pitch)
+        .ok_or_else(|| "tiles lie more than 0 and at most a million voxels apart".into())
+}
+
+/// Voxels per pixel.
+pub(crate) fn scale(text: &str) -> Result<f64, String> {
+    let scale: f64 = text.parse().map_err(|_| "give a number, such as 4")?;
+    let sensible = (1e-2..=1e3).contains(&scale);
+    sensible
+        .then_some(scale)
+        .ok_or_else(|| "a pixel is 0.01 to 1000 voxels large".into())
 }
 
 /// Width and height above 0, as `WxH`.

@@ -286,6 +286,20 @@ impl RecordWriter {
         }
     }
 
+    /// Makes what was appended survive a power cut.
+    ///
+    /// # Errors
+    ///
+    /// [`AcquisitionError::Write`].
+    pub fn sync(&self) -> Result<(), AcquisitionError> {
+        self.file
+            .sync_data()
+            .map_err(|source| AcquisitionError::Write {
+                source,
+                path: self.path.clone(),
+            })
+    }
+
     /// Appends a record in a single write.
     ///
     /// # Errors

@@ -8,6 +8,14 @@ use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, gray};
 /// Progressive files may refine the image as often as they like; this many times are enough.
 const MAX_SCANS: u32 = 500;
 
+/// Width and height.
+pub(super) fn size(head: &[u8]) -> Result<[u32; 2], ImageError> {
+    let mut decoder = Decompressor::new().map_err(broken)?;
+    let header = decoder.read_header(head).map_err(broken)?;
+    let size = |len: usize| u32::try_from(len).map_err(broken);
+    Ok([size(header.width)?, size(header.height)?])
+}
+
 pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Decoded, ImageError> {
     let bits = check_jpeg(bytes)?;
     if wanted.labels {

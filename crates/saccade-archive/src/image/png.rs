@@ -68,6 +68,18 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> 
     wanted.of_8(gray((width, height), voxels, channels, EXACT)?)
 }
 
+/// Width and height: of the first chunk, which is the header.
+pub(super) fn size(head: &[u8]) -> Result<[u32; 2], ImageError> {
+    match head.get(12..24) {
+        Some(&[b'I', b'H', b'D', b'R', a, b, c, d, e, f, g, h]) => Ok([
+            u32::from_be_bytes([a, b, c, d]),
+            u32::from_be_bytes([e, f, g, h]),
+        ]),
+        Some(_) => Err(broken("its header is missing")),
+        None => Err(incomplete("it ends within its header")),
+    }
+}
+
 fn sort(e: DecodingError) -> ImageError {
     match e {
         DecodingError::IoError(e) if e.kind() == io::ErrorKind::UnexpectedEof => {

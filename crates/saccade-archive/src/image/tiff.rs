@@ -102,6 +102,13 @@ pub(super) fn decode(
     wanted.of_8(gray((width, height), samples, channels, EXACT)?)
 }
 
+/// Width and height.
+pub(super) fn size(file: impl Read + Seek) -> Result<[u32; 2], ImageError> {
+    let mut decoder = Decoder::new(file).map_err(sort)?;
+    let (width, height) = decoder.dimensions().map_err(sort)?;
+    Ok([width, height])
+}
+
 /// Samples of 1, 2 or 4 bits, the first in the highest bits, times `scale`.
 pub(super) fn unpack(
     packed: &[u8],

@@ -4,11 +4,15 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::Args;
+use glam::{DVec2, DVec3, UVec3};
 use saccade_archive::VisualizationArchive;
+use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::pyramid::Encoding;
+use saccade_core::volume::{Dtype, check_name};
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
+use saccade_ingest::watch::{self, Disk, Pattern, Watch, WatchConfig};
 
-use crate::arguments::{Archive, volume_name};
+use crate::arguments::{Archive, extent, pitch, scale, volume_name, voxel_nm};
 use crate::interrupt::cancel_when_interrupted;
 use crate::progress::Shown;
 use crate::report::say;
@@ -33,9 +37,82 @@ pub(crate) struct Ingest {
     #[arg(long, value_parser = volume_name)]
     volume: Option<String>,
 
+    #[command(flatten)]
+    bare: Bare,
+
     /// Tiles in work at the same time [default: 2]
     #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
     workers: Option<u16>,
+}
+
+/// A folder without records: file names say what lies where.
+#[derive(Args)]
+#[group(id = "bare")]
+pub(crate) struct Bare {
+    /// The folder holds no records: its file names are like this, such as
+    /// 's{section}/r{row}_c{column}_{channel}.tif'; {channel} and folders as needed, {} is anything
+    #[arg(long, value_name = "PATTERN", requires_all = ["extent", "voxel", "pitch"])]
+    pattern: Option<Pattern>,
+
+    /// Size of the volume [voxels]
+    #[arg(long, value_name = "X,Y,Z", value_parser = extent, requires = "pattern")]
+    extent: Option<UVec3>,
+
+    /// Voxel size [nm]
+    #[arg(long, value_name = "X,Y,Z", value_parser = voxel_nm, requires = "pattern")]
+    voxel: Option<DVec3>,
+
+    /// From a tile's corner to the next column's and the next row's [voxels]
+    #[arg(long, value_name = "X,Y", value_parser = pitch, requires = "pattern")]
+    pitch: Option<DVec2>,
+
+    /// Size of a pixel [voxels] [default: 1]
+    #[arg(long, value_name = "NUMBER", value_parser = scale, requires = "pattern")]
+    pixel: Option<f64>,
+
+    /// Number of the first section, row and column [default: 0]
+    #[arg(long, value_name = "NUMBER", requires = "pattern")]
+    first: Option<u32>,
+
+    /// Names of the channels, in order [default: one without a name]
+    #[arg(
+        long,
+        value_name = "NAME,...",
+        value_delimiter = ',',
+        requires = "pattern"
+    )]
+    channels: Vec<String>,
+
+    /// Bits of a voxel, 8 or 16 [default: 8]
+    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u8).range(8..=16), requires = "pattern")]
+    bits: Option<u8>,
+}
+
+impl Bare {
+    /// What to watch, if the folder has no records; `name` is the volume's.
+    fn config(&self, name: &str) -> Result<Option<WatchConfig>> {
+        let (Some(pattern), Some(extent), Some(voxel_nm), Some(pitch)) =
+            (&self.pattern, self.extent, self.voxel, self.pitch)
+        else {
+            return Ok(None);
+        };
+        let mut info = AcquisitionInfo::new(name, extent, voxel_nm);
+        info.channels.clone_from(&self.channels);
+        info.dtype = match self.bits {
+            None | Some(8) => Dtype::Uint8,
+            Some(16) => Dtype::Uint16,
+            Some(bits) => anyhow::bail!("voxels have 8 or 16 bits, not {bits}"),
+        };
+        Ok(Some(WatchConfig {
+            pattern: pattern.clone(),
+            info,
+            pitch,
+            scale: self.pixel.unwrap_or(1.0),
+            first: self.first.unwrap_or(0),
+            poll: IngestOptions::DEFAULT.poll,
+            budget: WatchConfig::BUDGET,
+        }))
+    }
 }
 
 /// How pyramids are stored.
@@ -86,10 +163,26 @@ fn refuse_same_folder(acquisition: &Path, archive: &Path) -> Result<()> {
     Ok(())
 }
 
+/// A volume's name from a folder's.
+fn named_after(folder: &Path) -> String {
+    let name = folder
+        .file_name()
+        .map(|name| name.to_string_lossy().into_owned());
+    let name = name.filter(|name| check_name(name).is_ok());
+    name.unwrap_or_else(|| "volume".to_owned())
+}
+
 impl Ingest {
     pub(crate) async fn run(self) -> Result<()> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
-        saccade_archive::acquisition::AcquisitionInfo::read(&self.acquisition)?;
+        let name = self
+            .volume
+            .clone()
+            .unwrap_or_else(|| named_after(&self.acquisition));
+        let bare = self.bare.config(&name)?;
+        if bare.is_none() {
+            AcquisitionInfo::read(&self.acquisition)?;
+        }
         let location = self.archive.location()?;
         if let Some(folder) = location.folder() {
             refuse_same_folder(&self.acquisition, folder)?;
@@ -105,8 +198,35 @@ impl Ingest {
             ..IngestOptions::DEFAULT
         };
         let cancel = cancel_when_interrupted();
+        let mut acquisition = self.acquisition.clone();
+        let mut watching = None;
+        if let Some(config) = bare {
+            let beside = archive.catalog().path().with_file_name("watched");
+            let kept = beside.join(&name);
+            let mut watch = Watch::open(config, Disk, &self.acquisition, &kept)?;
+            acquisition = kept;
+            if self.once {
+                watch::run(&mut watch, true, &cancel)?;
+            } else {
+                let cancel = cancel.clone();
+                let looks = move || watch::run(&mut watch, false, &cancel);
+                watching = Some(tokio::task::spawn_blocking(looks));
+            }
+        }
         let shown = Shown::new("ingest", None);
-        let done = run(&self.acquisition, &archive, &options, &shown, &cancel).await;
+        let taken_in = run(&acquisition, &archive, &options, &shown, &cancel);
+        let done = match &mut watching {
+            None => taken_in.await,
+            // Whichever fails first is told; both end when they are cancelled.
+            Some(watching) => tokio::select! {
+                done = taken_in => done,
+                failed = watching => {
+                    failed??;
+                    return Ok(());
+                }
+            },
+        };
+        cancel.cancel();
         shown.finish();
         let Summary {
             tiles,

@@ -1,0 +1,214 @@
+//! What file names mean.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// A pattern of paths below a folder, such as `s{section}/r{row}_c{column}_{channel}.tif`.
+///
+/// `{section}`, `{row}` and `{column}` are numbers, `{channel}` a name; `{}` is anything that does not
+/// matter. Numbers are read as far as they go; names and anything end where what follows them begins.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Pattern {
+    /// Of each folder, and last of the file.
+    parts: Vec<Vec<Piece>>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Piece {
+    Text(String),
+    Number(Field),
+    Channel,
+    Anything,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Field {
+    Section,
+    Row,
+    Column,
+}
+
+/// A pattern that cannot be.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the pattern {pattern:?} {reason}; write it like s{{section}}/r{{row}}_c{{column}}.tif, with \
+     {{channel}} where there are several"
+)]
+pub struct PatternError {
+    /// As given.
+    pub pattern: String,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+/// What a name says.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Place {
+    /// Section, as it is numbered there.
+    pub section: u32,
+    /// Row.
+    pub row: u32,
+    /// Column.
+    pub column: u32,
+    /// Channel, if names say one.
+    pub channel: Option<String>,
+}
+
+impl Place {
+    /// A name for the tile, the same for the same place.
+    pub fn name(&self) -> String {
+        let Self {
+            section,
+            row,
+            column,
+            channel,
+        } = self;
+        let channel = channel
+            .as_ref()
+            .map_or_else(String::new, |c| format!("_{c}"));
+        format!("s{section}_r{row}_c{column}{channel}")
+    }
+}
+
+impl Pattern {
+    /// Folders above a file.
+    pub fn depth(&self) -> usize {
+        self.parts.len() - 1
+    }
+
+    /// Whether a folder, `depth` folders below the one watched, may hold files of this pattern: what is
+    /// known by then, `None` if not.
+    pub fn folder(&self, depth: usize, name: &str, known: &Place) -> Option<Place> {
+        let mut place = known.clone();
+        let part = self.parts.get(depth).filter(|_| depth < self.depth())?;
+        fits(part, name, &mut place).then_some(place)
+    }
+
+    /// What a file's name says, with what its folders said.
+    pub fn file(&self, name: &str, known: &Place) -> Option<Place> {
+        let mut place = known.clone();
+        fits(self.parts.last()?, name, &mut place).then_some(place)
+    }
+}
+
+/// Whether a name fits; what it says goes to `place`. What was said before must be said again.
+fn fits(pieces: &[Piece], name: &str, place: &mut Place) -> bool {
+    let Some((piece, after)) = pieces.split_first() else {
+        return name.is_empty();
+    };
+    match piece {
+        Piece::Text(text) => name
+            .strip_prefix(text.as_str())
+            .is_some_and(|rest| fits(after, rest, place)),
+        Piece::Number(field) => {
+            let digits = name.bytes().take_while(u8::is_ascii_digit).count();
+            let (number, rest) = name.split_at(digits);
+            let Ok(number) = number.parse() else {
+                return false;
+            };
+            let slot = match field {
+                Field::Section => &mut place.section,
+                Field::Row => &mut place.row,
+                Field::Column => &mut place.column,
+            };
+            *slot = number;
+            fits(after, rest, place)
+        }
+        Piece::Channel | Piece::Anything => {
+            // What follows is text or the end: two names beside each other are refused.
+            let ends: Vec<usize> = match after.first() {
+                Some(Piece::Text(text)) => name.match_indices(text.as_str()).map(|m| m.0).collect(),
+                _ => vec![name.len()],
+            };
+            ends.into_iter().any(|end| {
+                let mut told = place.clone();
+                if *piece == Piece::Channel {
+                    told.channel = Some(name[..end].to_owned());
+                }
+                let good =
+                    (end > 0 || *piece == Piece::Anything) && fits(after, &name[end..], &mut told);
+                if good {
+                    *place = told;
+                }
+                good
+            })
+        }
+    }
+}
+
+impl FromStr for Pattern {
+    type Err = PatternError;
+
+    fn from_str(pattern: &str) -> Result<Self, PatternError> {
+        let wrong = |reason: &str| PatternError {
+            pattern: pattern.to_owned(),
+            reason: reason.to_owned(),
+        };
+        let mut parts = Vec::new();
+        let mut named = Vec::new();
+        for part in pattern.split('/') {
+            if matches!(part, "" | "." | "..") {
+                return Err(wrong("has a folder without a name"));
+            }
+            let mut pieces: Vec<Piece> = Vec::new();
+            let mut rest = part;
+            while !rest.is_empty() {
+                let text = rest.split('{').next().unwrap_or_default();
+                if !text.is_empty() {
+                    pieces.push(Piece::Text(text.to_owned()));
+                    rest = &rest[text.len()..];
+                    continue;
+                }
+                let Some((field, after)) = rest[1..].split_once('}') else {
+                    return Err(wrong("has a { without its }"));
+                };
+                let piece = match field {
+                    "section" => Piece::Number(Field::Section),
+                    "row" => Piece::Number(Field::Row),
+                    "column" => Piece::Number(Field::Column),
+                    "channel" => Piece::Channel,
+                    "" => Piece::Anything,
+                    _ => return Err(wrong(&format!("has an unknown field {{{field}}}"))),
+                };
+                if !field.is_empty() && named.contains(&field) {
+                    return Err(wrong(&format!("says {{{field}}} twice")));
+                }
+                if pieces
+                    .last()
+                    .is_some_and(|last| !matches!(last, Piece::Text(_)))
+                {
+                    return Err(wrong("has two fields with nothing between them"));
+                }
+                named.push(field);
+                pieces.push(piece);
+                rest = after;
+            }
+            parts.push(pieces);
+        }
+        if !named.contains(&"section") {
+            return Err(wrong("does not say where the number of the {section} is"));
+        }
+        Ok(Self { parts })
+    }
+}
+
+impl fmt::Display for Pattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (n, part) in self.parts.iter().enumerate() {
+            if n > 0 {
+                f.write_str("/")?;
+            }
+            for piece in part {
+                match piece {
+                    Piece::Text(text) => f.write_str(text)?,
+                    Piece::Number(Field::Section) => f.write_str("{section}")?,
+                    Piece::Number(Field::Row) => f.write_str("{row}")?,
+                    Piece::Number(Field::Column) => f.write_str("{column}")?,
+                    Piece::Channel => f.write_str("{channel}")?,
+                    Piece::Anything => f.write_str("{}")?,
+                }
+            }
+        }
+        Ok(())
+    }
+}

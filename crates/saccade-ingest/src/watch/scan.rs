@@ -1,0 +1,314 @@
+//! Which files are new, found with few questions to the file system.
+
+use std::collections::{HashMap, VecDeque};
+use std::fs;
+use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use super::{Pattern, Place};
+
+/// What changes when a file does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Stamp {
+    /// Length \[bytes\].
+    pub bytes: u64,
+    /// Last modification.
+    pub modified: SystemTime,
+}
+
+/// What a folder holds.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Entry {
+    /// Name.
+    pub name: String,
+    /// Whether it is a folder.
+    pub folder: bool,
+}
+
+/// A file system, as far as watching asks it. Every call is one question, and every entry another.
+pub trait Folders {
+    /// When something was last added to a folder, or taken away.
+    ///
+    /// # Errors
+    ///
+    /// What the system says.
+    fn modified(&self, folder: &Path) -> io::Result<SystemTime>;
+
+    /// What is in a folder, one after another.
+    ///
+    /// # Errors
+    ///
+    /// What the system says.
+    fn list(&self, folder: &Path)
+    -> io::Result<Box<dyn Iterator<Item = io::Result<Entry>> + Send>>;
+
+    /// What a file looks like.
+    ///
+    /// # Errors
+    ///
+    /// What the system says.
+    fn stamp(&self, file: &Path) -> io::Result<Stamp>;
+
+    /// Now, by the clock that stamps files.
+    fn now(&self) -> SystemTime;
+}
+
+/// The file system itself.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Disk;
+
+impl Folders for Disk {
+    fn modified(&self, folder: &Path) -> io::Result<SystemTime> {
+        fs::metadata(folder)?.modified()
+    }
+
+    fn list(
+        &self,
+        folder: &Path,
+    ) -> io::Result<Box<dyn Iterator<Item = io::Result<Entry>> + Send>> {
+        let entries = fs::read_dir(folder)?.filter_map(|entry| {
+            let entry = match entry {
+                Ok(entry) => entry,
+                Err(e) => return Some(Err(e)),
+            };
+            // A name that is no text fits no pattern.
+            let name = entry.file_name().into_string().ok()?;
+            // It may be gone by now.
+            let folder = entry.file_type().is_ok_and(|kind| kind.is_dir());
+            Some(Ok(Entry { name, folder }))
+        });
+        Ok(Box::new(entries))
+    }
+
+    fn stamp(&self, file: &Path) -> io::Result<Stamp> {
+        let meta = fs::metadata(file)?;
+        Ok(Stamp {
+            bytes: meta.len(),
+            modified: meta.modified()?,
+        })
+    }
+
+    fn now(&self) -> SystemTime {
+        SystemTime::now()
+    }
+}
+
+/// A file that is new, or another than before.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Found {
+    /// Below the watched folder.
+    pub file: String,
+    /// What its name says.
+    pub place: Place,
+}
+
+/// What to do after a look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Next {
+    /// Look again at once: the budget ended before the round did.
+    More,
+    /// Look again later: something changed, and may change again before its time shows it.
+    Again,
+    /// Look again later: nothing changed.
+    Rest,
+}
+
+/// A folder's time counts only once it is this old: file systems stamp coarsely, and a file may have been
+/// added in the same tick after the folder was listed.
+const SETTLED: Duration = Duration::from_secs(3);
+
+struct Known {
+    /// Below the watched folder; empty for itself.
+    path: PathBuf,
+    depth: usize,
+    place: Place,
+    /// Its time when it was last listed whole; `None` if it must be listed again.
+    listed: Option<SystemTime>,
+}
+
+struct Listing {
+    folder: usize,
+    /// Its time before it was listed.
+    modified: Option<SystemTime>,
+    entries: Box<dyn Iterator<Item = io::Result<Entry>> + Send>,
+}
+
+/// Goes round the folders, a bounded number of questions at a time.
+pub struct Scanner<F> {
+    folders: F,
+    root: PathBuf,
+    pattern: Pattern,
+    known: Vec<Known>,
+    /// Which folders come next.
+    round: VecDeque<usize>,
+    /// Folders left of this round, those included that it finds.
+    to_ask: usize,
+    /// Whether this round found a folder that changed.
+    changed: bool,
+    /// Folders by path, so that none is known twice.
+    paths: HashMap<PathBuf, usize>,
+    listing: Option<Listing>,
+    /// What each file looked like, by the hash of its path.
+    files: HashMap<u64, u64>,
+    /// Files told of before this process, at this time or earlier.
+    told: HashMap<u64, SystemTime>,
+    hasher: BuildHasherDefault<DefaultHasher>,
+}
+
+impl<F: Folders> Scanner<F> {
+    /// A scanner of everything below `root` that fits the pattern.
+    pub fn new(folders: F, root: &Path, pattern: Pattern) -> Self {
+        let known = Known {
+            path: PathBuf::new(),
+            depth: 0,
+            place: Place::default(),
+            listed: None,
+        };
+        Self {
+            folders,
+            root: root.to_owned(),
+            pattern,
+            known: vec![known],
+            round: VecDeque::from([0]),
+            to_ask: 1,
+            changed: false,
+            paths: HashMap::from([(PathBuf::new(), 0)]),
+            listing: None,
+            files: HashMap::new(),
+            told: HashMap::new(),
+            hasher: BuildHasherDefault::default(),
+        }
+    }
+
+    /// Now, by the clock that stamps files.
+    pub(super) fn now(&self) -> SystemTime {
+        self.folders.now()
+    }
+
+    /// Says that a file was told of by an earlier process, no later than `at`.
+    pub fn remember(&mut self, file: &str, at: SystemTime) {
+        self.told.insert(self.hasher.hash_one(file), at);
+    }
+
+    /// Goes on with the round of the folders, to its end or with at most `budget` questions; what was found, and what to do next.
+    ///
+    /// # Errors
+    ///
+    /// If the watched folder itself cannot be asked. One below that cannot is passed over until the next
+    /// round.
+    pub fn look(&mut self, budget: usize) -> io::Result<(Vec<Found>, Next)> {
+        let mut found = Vec::new();
+        let mut left = budget.max(1);
+        loop {
+            if left == 0 {
+                return Ok((found, Next::More));
+            }
+            if self.listing.is_some() {
+                let before = self.known.len();
+                left -= 1;
+                self.step(&mut found, &mut left);
+                self.to_ask += self.known.len() - before;
+                self.changed = true;
+                continue;
+            }
+            if self.to_ask == 0 {
+                self.to_ask = self.known.len();
+                let changed = std::mem::take(&mut self.changed);
+                return Ok((found, if changed { Next::Again } else { Next::Rest }));
+            }
+            self.round.rotate_left(1);
+            let Some(&folder) = self.round.back() else {
+                return Ok((found, Next::Rest));
+            };
+            self.to_ask -= 1;
+            left -= 1;
+            let Known { path, listed, .. } = &self.known[folder];
+            let whole = path.as_os_str().is_empty();
+            let path = self.root.join(path);
+            let asked = self.folders.modified(&path).and_then(|modified| {
+                let changed = *listed != Some(modified);
+                let entries = changed.then(|| self.folders.list(&path)).transpose()?;
+                Ok((modified, entries))
+            });
+            match asked {
+                Ok((modified, Some(entries))) => {
+                    let age = self.folders.now().duration_since(modified);
+                    let settled = age.is_ok_and(|age| age > SETTLED);
+                    self.listing = Some(Listing {
+                        folder,
+                        modified: settled.then_some(modified),
+                        entries,
+                    });
+                }
+                Ok((_, None)) => {}
+                Err(e) if whole => return Err(e),
+                Err(e) => log::warn!("cannot look into {}: {e}", path.display()),
+            }
+        }
+    }
+
+    /// One entry of the folder that is being listed.
+    fn step(&mut self, found: &mut Vec<Found>, left: &mut usize) {
+        let Some(listing) = &mut self.listing else {
+            return;
+        };
+        let folder = listing.folder;
+        let entry = match listing.entries.next() {
+            Some(Ok(entry)) => entry,
+            end => {
+                // One that broke off is listed again.
+                self.known[folder].listed = listing.modified.filter(|_| end.is_none());
+                self.listing = None;
+                return;
+            }
+        };
+        let Known {
+            path, depth, place, ..
+        } = &self.known[folder];
+        let below = path.join(&entry.name);
+        if entry.folder {
+            if let Some(place) = self.pattern.folder(*depth, &entry.name, place)
+                && !self.paths.contains_key(&below)
+            {
+                let depth = depth + 1;
+                let index = self.known.len();
+                self.paths.insert(below.clone(), index);
+                self.known.push(Known {
+                    path: below,
+                    depth,
+                    place,
+                    listed: None,
+                });
+                self.round.push_front(index);
+            }
+            return;
+        }
+        if *depth != self.pattern.depth() {
+            return;
+        }
+        let Some(place) = self.pattern.file(&entry.name, place) else {
+            return;
+        };
+        *left = left.saturating_sub(1);
+        let Ok(stamp) = self.folders.stamp(&self.root.join(&below)) else {
+            // Gone, or not to be seen: the folder is looked through again.
+            listing.modified = None;
+            return;
+        };
+        // The pattern is text, so the path is.
+        let file = below.to_string_lossy().into_owned();
+        let (key, seen) = (self.hasher.hash_one(&file), self.hasher.hash_one(stamp));
+        let before = self.files.insert(key, seen);
+        let told = self.told.remove(&key);
+        let same = match (before, told) {
+            (Some(before), _) => before == seen,
+            (None, Some(told)) => stamp.modified <= told,
+            (None, None) => false,
+        };
+        if !same {
+            found.push(Found { file, place });
+        }
+    }
+}

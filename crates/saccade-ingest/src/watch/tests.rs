@@ -1,0 +1,326 @@
+use std::cell::Cell;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::rc::Rc;
+use std::sync::{Arc, Mutex};
+use std::time::SystemTime;
+
+use glam::{DVec3, UVec3};
+use saccade_archive::image::GrayImage;
+
+use super::*;
+use crate::simulate::write::write_part;
+
+fn pattern(text: &str) -> Pattern {
+    let pattern: Pattern = text.parse().unwrap();
+    assert_eq!(pattern.to_string(), text);
+    pattern
+}
+
+#[test]
+fn names_say_where() {
+    let place = |section, row, column, channel: Option<&str>| Place {
+        section,
+        row,
+        column,
+        channel: channel.map(str::to_owned),
+    };
+    let flat = pattern("s{section}_r{row}_c{column}.tif");
+    let none = Place::default();
+    assert_eq!(flat.depth(), 0);
+    assert_eq!(
+        flat.file("s012_r3_c10.tif", &none),
+        Some(place(12, 3, 10, None))
+    );
+    for other in [
+        "s_r3_c1.tif",
+        "s1_r3_c1.tiff",
+        "xs1_r3_c1.tif",
+        "s1_r3_c1",
+        "",
+        "s1_r3_c99999999999.tif",
+    ] {
+        assert_eq!(flat.file(other, &none), None, "{other}");
+    }
+    let deep = pattern("run{}/Sec{section}/{row}-{column}_{channel}_{}.png");
+    assert_eq!(deep.depth(), 2);
+    let run = deep.folder(0, "run of May", &none).unwrap();
+    let section = deep.folder(1, "Sec7", &run).unwrap();
+    assert_eq!(deep.folder(1, "Section7", &run), None);
+    assert_eq!(deep.folder(2, "Sec7", &section), None, "a file's place");
+    let seen = deep.file("4-5_SE_2_x.png", &section);
+    assert_eq!(seen, Some(place(7, 4, 5, Some("SE"))));
+    assert_eq!(
+        deep.file("4-5__x.png", &section),
+        None,
+        "a channel has a name"
+    );
+    for bad in [
+        "r{row}.tif",
+        "{section}{row}",
+        "s{section",
+        "{section}{depth}",
+        "{section}_{section}",
+        "a//{section}",
+        "../{section}",
+    ] {
+        assert!(bad.parse::<Pattern>().is_err(), "{bad}");
+    }
+}
+
+/// When a folder was changed, and what is in it.
+type Listed = (u64, Vec<Entry>);
+
+/// A file system of numbers, which counts what it is asked.
+#[derive(Clone, Default)]
+struct Counted {
+    folders: Arc<Mutex<BTreeMap<PathBuf, Listed>>>,
+    stamps: Arc<Mutex<BTreeMap<PathBuf, u64>>>,
+    asked: Rc<Cell<usize>>,
+    entries: Arc<std::sync::atomic::AtomicUsize>,
+}
+
+impl Counted {
+    fn at(time: u64) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::from_secs(time)
+    }
+
+    fn add(&self, folder: &str, name: &str, is_folder: bool, time: u64) {
+        let mut folders = self.folders.lock().unwrap();
+        let path = Path::new("/r").join(folder);
+        let path = if folder.is_empty() {
+            PathBuf::from("/r")
+        } else {
+            path
+        };
+        let (modified, entries) = folders.entry(path).or_default();
+        *modified = time;
+        let name = name.to_owned();
+        entries.push(Entry {
+            name,
+            folder: is_folder,
+        });
+    }
+
+    /// Questions and entries since the last time.
+    fn take(&self) -> usize {
+        self.asked.take() + self.entries.swap(0, std::sync::atomic::Ordering::Relaxed)
+    }
+}
+
+impl Folders for Counted {
+    fn modified(&self, folder: &Path) -> io::Result<SystemTime> {
+        self.asked.set(self.asked.get() + 1);
+        let folders = self.folders.lock().unwrap();
+        let (modified, _) = folders.get(folder).ok_or(io::ErrorKind::NotFound)?;
+        Ok(Self::at(*modified))
+    }
+
+    fn list(
+        &self,
+        folder: &Path,
+    ) -> io::Result<Box<dyn Iterator<Item = io::Result<Entry>> + Send>> {
+        self.asked.set(self.asked.get() + 1);
+        let entries = self.folders.lock().unwrap()[folder].1.clone();
+        let count = Arc::clone(&self.entries);
+        Ok(Box::new(entries.into_iter().map(move |entry| {
+            count.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            Ok(entry)
+        })))
+    }
+
+    fn stamp(&self, file: &Path) -> io::Result<Stamp> {
+        self.asked.set(self.asked.get() + 1);
+        let stamps = self.stamps.lock().unwrap();
+        let modified = Self::at(stamps.get(file).copied().unwrap_or(1));
+        Ok(Stamp { bytes: 9, modified })
+    }
+
+    fn now(&self) -> SystemTime {
+        Self::at(1_000_000)
+    }
+}
+
+/// However much there is, a look asks so many questions; and once all is known, only folders are asked.
+#[test]
+fn a_look_at_a_large_archive_is_a_bounded_number_of_questions() {
+    let (sections, tiles, budget) = (400, 250, 5_000);
+    let disk = Counted::default();
+    for section in 0..sections {
+        disk.add("", &format!("s{section}"), true, 100);
+        for tile in 0..tiles {
+            disk.add(
+                &format!("s{section}"),
+                &format!("r{tile}_c0.tif"),
+                false,
+                100,
+            );
+        }
+        disk.add(&format!("s{section}"), "notes.txt", false, 100);
+    }
+    let pattern = pattern("s{section}/r{row}_c{column}.tif");
+    let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern);
+    let (mut found, mut looks) = (0, 0);
+    loop {
+        let (new, next) = scanner.look(budget).unwrap();
+        let asked = disk.take();
+        assert!(asked <= budget + 2, "{asked} questions");
+        found += new.len();
+        looks += 1;
+        assert!(looks < 100, "it comes to an end");
+        if next == Next::Rest {
+            break;
+        }
+    }
+    assert_eq!(found, sections * tiles);
+    assert!(looks >= sections * tiles / budget);
+
+    // Nothing new: the folders, and nothing in them.
+    let (new, next) = scanner.look(budget).unwrap();
+    assert_eq!((new.len(), next), (0, Next::Rest));
+    assert_eq!(disk.take(), sections + 1);
+    // One new file: that folder alone is listed.
+    disk.add("s77", "r900_c1.tif", false, 200);
+    let (new, _) = scanner.look(budget).unwrap();
+    assert_eq!(new[0].file, "s77/r900_c1.tif");
+    assert_eq!((new[0].place.section, new[0].place.row), (77, 900));
+    let asked = disk.take();
+    assert!(asked <= sections + 1 + 2 * (tiles + 4), "{asked} questions");
+    // A file put in the place of another.
+    disk.stamps
+        .lock()
+        .unwrap()
+        .insert("/r/s5/r7_c0.tif".into(), 300);
+    disk.add("s5", ".other", false, 300);
+    let (new, _) = scanner.look(budget).unwrap();
+    assert_eq!(
+        new.iter().map(|f| &*f.file).collect::<Vec<_>>(),
+        ["s5/r7_c0.tif"]
+    );
+}
+
+/// A folder that changes in the tick in which it is listed is listed again.
+#[test]
+fn a_file_that_comes_while_its_folder_is_listed_is_found() {
+    let disk = Counted::default();
+    disk.add("", "s1.tif", false, 1_000_000);
+    let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern("s{section}.tif"));
+    let (new, next) = scanner.look(100).unwrap();
+    assert_eq!((new.len(), next), (1, Next::Again));
+    disk.add("", "s2.tif", false, 1_000_000);
+    let (new, _) = scanner.look(100).unwrap();
+    assert_eq!(new.len(), 1);
+}
+
+fn image(path: &Path, size: u32, value: u8) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let voxels = vec![value; (size * size) as usize];
+    let part = write_part(path, &GrayImage::new(size, size, voxels)).unwrap();
+    fs::rename(part, path).unwrap();
+}
+
+fn config() -> WatchConfig {
+    let mut info = AcquisitionInfo::new("v", UVec3::new(500, 500, 9), DVec3::ONE);
+    info.channels = vec!["a".to_owned(), "b".to_owned()];
+    WatchConfig {
+        pattern: "s{section}/r{row}_c{column}_{channel}.tif".parse().unwrap(),
+        info,
+        pitch: DVec2::new(90.0, 80.0),
+        scale: 2.0,
+        first: 1,
+        poll: Duration::from_millis(500),
+        budget: 7,
+    }
+}
+
+fn told(kept: &Path) -> Vec<TileRecord> {
+    let mut reader = RecordReader::new(kept, Cursor::default());
+    let lines = reader.read(999).unwrap();
+    let tile = |record| match record {
+        Record::Tile(tile) => tile,
+        other => panic!("{other:?}"),
+    };
+    lines
+        .into_iter()
+        .map(|line| tile(line.record.unwrap()))
+        .collect()
+}
+
+/// All looks until there is nothing to do at once.
+fn looks(watch: &mut Watch<Disk>) {
+    while watch.look().unwrap().1 == Next::More {}
+}
+
+#[test]
+fn records_are_written_once_also_by_another_process() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    for column in 1..4 {
+        image(&scope.join(format!("s3/r2_c{column}_b.tif")), 40, 9);
+    }
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    looks(&mut watch);
+    let mut tiles = told(&kept);
+    tiles.sort_by(|a, b| a.tile.cmp(&b.tile));
+    assert_eq!(tiles.len(), 3);
+    assert_eq!(
+        (&*tiles[0].tile, tiles[0].section, tiles[0].size),
+        ("s3_r2_c1_b", 2, UVec2::splat(40))
+    );
+    assert_eq!(
+        tiles[2].transform.elements(),
+        [2.0, 0.0, 0.0, 2.0, 180.0, 80.0]
+    );
+    assert_eq!(tiles[0].channel_among(&config().info.channels), Some(1));
+    let path = saccade_archive::acquisition::image_path(&kept, &tiles[1].file).unwrap();
+    assert!(path.is_file(), "ingest finds it through the link");
+    drop(watch);
+
+    // Another process, after one more came and one was imaged again.
+    image(&scope.join("s4/r1_c1_a.tif"), 40, 9);
+    std::thread::sleep(Duration::from_millis(20));
+    image(&scope.join("s3/r2_c2_b.tif"), 48, 10);
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    let names: Vec<_> = told(&kept)[3..]
+        .iter()
+        .map(|t| (t.tile.clone(), t.size.x))
+        .collect();
+    let want = [("s3_r2_c2_b", 48), ("s4_r1_c1_a", 40)].map(|(name, size)| (name.to_owned(), size));
+    let mut sorted = names.clone();
+    sorted.sort();
+    assert_eq!(sorted, want);
+
+    // Another volume, or another folder, is not mixed in.
+    let mut other = config();
+    other.info.extent.x = 1;
+    let refused = Watch::open(other, Disk, &scope, &kept).err().unwrap();
+    assert!(matches!(refused, WatchError::Other { .. }), "{refused}");
+    let refused = Watch::open(config(), Disk, folder.path(), &kept)
+        .err()
+        .unwrap();
+    assert!(matches!(refused, WatchError::Other { .. }), "{refused}");
+}
+
+#[test]
+fn a_file_without_its_head_is_looked_at_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    fs::create_dir_all(scope.join("s1")).unwrap();
+    let path = scope.join("s1/r1_c1_a.tif");
+    fs::write(&path, b"II").unwrap();
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    assert_eq!(told(&kept), []);
+    image(&path, 32, 1);
+    looks(&mut watch);
+    assert_eq!(told(&kept)[0].size, UVec2::splat(32));
+    // What never becomes an image is told as well: ingest says what is wrong with it.
+    fs::write(scope.join("s1/r1_c2_a.tif"), b"GIF89a, not a TIFF").unwrap();
+    for _ in 0..5 {
+        looks(&mut watch);
+        std::thread::sleep(Duration::from_millis(600));
+    }
+    assert!(told(&kept).iter().any(|t| t.tile == "s1_r1_c2_a"));
+}
