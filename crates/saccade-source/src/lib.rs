@@ -1,7 +1,7 @@
 //! Where voxels come from.
 //!
 //! A [`VolumeSource`] describes a volume and delivers its chunks on demand: stitched from the tiles
-//! of an archive ([`stitched`]), from an array in memory ([`memory`]), or from a Saccade server
+//! of an archive ([`stitched`]), from an OME-Zarr image ([`zarr`]), an array in memory ([`memory`]), or a Saccade server
 //! ([`remote`]). What a source cannot do is wait for the eye: everything above asks for chunks it
 //! needs now, in the order of need, and drops the requests it no longer needs.
 //!
@@ -28,6 +28,8 @@ pub mod remote;
 mod source;
 #[cfg(not(target_family = "wasm"))]
 pub mod stitched;
+#[cfg(not(target_family = "wasm"))]
+pub mod zarr;
 
 pub use source::{
     Change, ChangeReason, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource,

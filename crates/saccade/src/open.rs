@@ -1,5 +1,6 @@
-//! Volumes that the command line names: of a server or of an archive.
+//! Volumes that the command line names: of a server, of an archive, or an image in a folder.
 
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
 
@@ -9,6 +10,7 @@ use saccade_serve::{CatalogStatus, StatusSource};
 use saccade_source::VolumeSource;
 use saccade_source::remote::{Quarantined, RemoteSource, Status, volumes};
 use saccade_source::stitched::StitchedSource;
+use saccade_source::zarr::ZarrSource;
 use saccade_view::AcquisitionReader;
 
 use crate::arguments::CatalogArgument;
@@ -19,6 +21,8 @@ use crate::stitching::Stitching;
 pub(crate) enum Place {
     /// The address of a server.
     Server(String),
+    /// An OME-Zarr image in a folder.
+    Zarr(PathBuf),
     /// A visualization archive.
     Archive(StorageLocation),
 }
@@ -29,6 +33,8 @@ impl FromStr for Place {
         let server = text.starts_with("http://") || text.starts_with("https://");
         Ok(if server {
             Self::Server(text.to_owned())
+        } else if ZarrSource::is_zarr(Path::new(text)) {
+            Self::Zarr(text.into())
         } else {
             Self::Archive(text.parse()?)
         })
@@ -71,6 +77,21 @@ impl Place {
                 Ok(Opened {
                     source: Arc::new(source),
                     acquisition: Some(acquisition),
+                })
+            }
+            Self::Zarr(folder) => {
+                ensure!(
+                    !catalog.is_given(),
+                    "an OME-Zarr image has no catalog: leave out --catalog"
+                );
+                let source = ZarrSource::open(folder).await?;
+                if let Some(name) = name {
+                    let own = &source.volume().name;
+                    ensure!(name == own, "the image is called {own:?}, not {name:?}");
+                }
+                Ok(Opened {
+                    source: Arc::new(source),
+                    acquisition: None,
                 })
             }
             Self::Archive(storage) => {

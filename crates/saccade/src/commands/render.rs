@@ -32,8 +32,8 @@ fn channels(text: &str) -> Result<Channels, ShownError> {
 #[derive(Args)]
 pub(crate) struct Render {
     /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
-    /// --catalog
-    #[arg(value_name = "URL|ARCHIVE")]
+    /// --catalog; or the folder of an OME-Zarr image
+    #[arg(value_name = "URL|ARCHIVE|IMAGE")]
     place: Place,
 
     #[command(flatten)]

@@ -1,6 +1,7 @@
 //! `saccade serve`: an archive over HTTP.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Result;
@@ -8,12 +9,14 @@ use clap::Args;
 use saccade_archive::VisualizationArchive;
 use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, offer_archive};
 
+use saccade_source::zarr::ZarrSource;
+
 use crate::arguments::Archive;
 use crate::interrupt::interrupted;
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
 
-/// Offer the volumes of an archive over HTTP, with the browser application.
+/// Offer the volumes of an archive, or an OME-Zarr image, over HTTP, with the browser application.
 #[derive(Args)]
 pub(crate) struct Serve {
     #[command(flatten)]
@@ -73,6 +76,16 @@ const POLL: Duration = Duration::from_secs(2);
 
 impl Serve {
     pub(crate) async fn run(self) -> Result<()> {
+        if let Some(folder) = self.archive.image() {
+            let volumes = Volumes::new();
+            volumes.publish(Arc::new(ZarrSource::open(folder).await?), None);
+            let server = Server::bind(self.at.address()).await?;
+            tell(&server.url());
+            server
+                .run(volumes, self.at.options(), interrupted())
+                .await?;
+            return Ok(());
+        }
         let archive = VisualizationArchive::open(&self.archive.location()?).await?;
         let server = Server::bind(self.at.address()).await?;
         let volumes = Volumes::new();

@@ -13,8 +13,8 @@ use crate::stitching::Stitching;
 #[derive(Args)]
 pub(crate) struct View {
     /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
-    /// --catalog
-    #[arg(value_name = "URL|ARCHIVE")]
+    /// --catalog; or the folder of an OME-Zarr image
+    #[arg(value_name = "URL|ARCHIVE|IMAGE")]
     place: Place,
 
     #[command(flatten)]
