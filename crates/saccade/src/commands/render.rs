@@ -177,7 +177,9 @@ impl Render {
             image::ImageFormat::Png,
         )
         .with_context(|| format!("cannot write the picture {}", self.output.display()))?;
-        tell(&fidelity(&status));
+        let counted = session.channels().iter().map(|c| c.histogram.total());
+        let empty = status.revision == 0 && counted.sum::<u64>() == 0;
+        tell(&fidelity(&status, empty));
         if let Some(failure) = &status.progress.failure {
             say(&format!("not all could be read: {failure}"));
         }
@@ -204,21 +206,23 @@ impl Render {
 }
 
 /// How true the picture is, on one line.
-fn fidelity(status: &Status) -> String {
+fn fidelity(status: &Status, empty: bool) -> String {
     let level = match status.fidelity.level {
         Some(level) => format!("level {level}"),
         None => "nothing of the volume in view".to_owned(),
     };
-    if status.revision == 0 {
+    // Files have no revision.
+    let revision = match status.revision {
+        0 => String::new(),
+        revision => format!(", revision {revision}"),
+    };
+    if empty {
         // Complete it is, but so is every picture of nothing.
-        "the volume has no tiles yet: the picture is empty".to_owned()
+        "nothing was acquired yet: the picture is empty".to_owned()
     } else if status.complete {
-        format!("complete, {level}, revision {}", status.revision)
+        format!("complete, {level}{revision}")
     } else {
         let missing = status.fidelity.missing;
-        format!(
-            "{missing} bricks missing, {level}, revision {}",
-            status.revision
-        )
+        format!("{missing} bricks missing, {level}{revision}")
     }
 }

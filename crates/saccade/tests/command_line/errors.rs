@@ -278,7 +278,7 @@ fn a_volume_without_tiles() {
     assert!(output.status.success(), "{}", stderr(&output));
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(
-        said.contains("no tiles yet") && !said.contains("complete"),
+        said.contains("nothing was acquired yet") && !said.contains("complete"),
         "{said}"
     );
 }
