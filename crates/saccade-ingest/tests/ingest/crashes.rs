@@ -260,10 +260,10 @@ impl Scene {
         };
         match select(pin!(disk.power_is_off()), pin!(work)).await {
             Either::Left(_) => None,
-            // Opening does not wait for anything: it may fail before anybody looks.
+            // It may also end in the instant in which the power goes, before anybody looks.
             Either::Right((ended, off)) => match off.now_or_never() {
-                Some(()) if ended.is_err() => None,
-                _ => Some(ended),
+                Some(()) => None,
+                None => Some(ended),
             },
         }
     }
