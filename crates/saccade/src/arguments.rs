@@ -75,11 +75,30 @@ pub(crate) fn voxel_nm(text: &str) -> Result<DVec3, String> {
             Err(_) => return Err("give nanometres as x,y,z".into()),
         },
     };
-    let sensible = nm.is_finite() && nm.min_element() > 0.0;
-    sensible
+    let sensible = nm.min_element() > 0.0 && nm.max_element() <= LARGEST_VOXEL;
+    (nm.is_finite() && sensible)
         .then_some(nm)
-        .ok_or_else(|| "voxel sizes must be above 0".into())
+        .ok_or_else(|| "voxel sizes must be above 0, and at most a metre".into())
 }
+
+/// A spread of rotations \[degrees\].
+pub(crate) fn degrees(text: &str) -> Result<f64, String> {
+    within(text, 45.0, "stages turn tiles by 0 to 45 degrees")
+}
+
+/// A spread of shifts \[pixels\].
+pub(crate) fn pixels(text: &str) -> Result<f64, String> {
+    within(text, 65_536.0, "stages shift tiles by 0 to 65536 pixels")
+}
+
+fn within(text: &str, most: f64, must: &str) -> Result<f64, String> {
+    let value: Option<f64> = text.parse().ok();
+    let value = value.filter(|value| (0.0..=most).contains(value));
+    value.ok_or_else(|| must.to_owned())
+}
+
+/// Largest voxel \[nm\]: a metre.
+const LARGEST_VOXEL: f64 = 1e9;
 
 /// Distances above 0, as `x,y`.
 pub(crate) fn pitch(text: &str) -> Result<DVec2, String> {
@@ -207,6 +226,10 @@ mod tests {
         }
         assert!(size("0x4").is_err() && size("64").is_err() && size("64x64x64").is_err());
         assert!(voxel_nm("4,4,0").is_err() && voxel_nm("4,nan,4").is_err());
+        assert!(voxel_nm("1e308").is_err() && degrees("400").is_err() && degrees("nan").is_err());
+        assert!(pixels("1e300").is_err() && pixels("24").is_ok() && degrees("0.5").is_ok());
+        assert!(pitch("10800,9000.5").is_ok() && pitch("0,1").is_err() && pitch("1").is_err());
+        assert!(scale("4").is_ok() && scale("0").is_err() && scale("1e4").is_err());
         assert!(rate("0").is_err() && rate("-1").is_err() && rate("fast").is_err());
         assert!(seconds("-1").is_err() && seconds("soon").is_err() && seconds("0.5").is_ok());
     }

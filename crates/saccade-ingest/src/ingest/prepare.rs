@@ -14,6 +14,7 @@ use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
 use saccade_archive::storage::Storage;
+use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Dtype;
 
 use super::IngestError;
@@ -157,6 +158,19 @@ impl Context<'_> {
             );
             return Ok(quarantine(&record, reason, bytes, None));
         }
+        if record.tile.trim().is_empty() {
+            let reason = "the record's tile has no name, by which later records could speak of it; append \
+                          it again with one";
+            return Ok(quarantine(&record, reason.to_owned(), bytes, None));
+        }
+        if !scale_is_sensible(transform) {
+            let reason = format!(
+                "a pixel of the tile would be larger than {LARGEST_PIXEL} voxels, or smaller than a \
+                 {LARGEST_PIXEL}th of one (transform {:?}); check the transform: it leads to level-0 voxels",
+                transform.elements(),
+            );
+            return Ok(quarantine(&record, reason, bytes, None));
+        }
         if place(self.extent, section, size, transform).is_none() {
             let reason = format!(
                 "the tile lies wholly outside the volume of {} voxels (section {section}, transform \
@@ -244,6 +258,18 @@ impl Context<'_> {
             }
         }
     }
+}
+
+/// Most voxels that a pixel may span along an axis, and most pixels that a voxel may.
+const LARGEST_PIXEL: f64 = 512.0;
+
+/// Whether pixels are about as large as an overview's, or a fine region's, could be.
+fn scale_is_sensible(transform: SectionFromTile) -> bool {
+    let [a, b, c, d, ..] = transform.elements();
+    let sensible = 1.0 / LARGEST_PIXEL..=LARGEST_PIXEL;
+    [a.hypot(b), c.hypot(d)]
+        .iter()
+        .all(|s| sensible.contains(s))
 }
 
 /// Why there is no pyramid.
@@ -357,7 +383,6 @@ fn with_sources(error: &(dyn std::error::Error + 'static)) -> String {
 mod tests {
     use super::*;
     use saccade_archive::storage::check_name;
-    use saccade_core::transform::SectionFromTile;
 
     #[test]
     fn every_record_has_its_own_pyramid_name() {

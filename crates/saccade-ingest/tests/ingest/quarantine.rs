@@ -175,6 +175,25 @@ async fn a_tile_outside_the_volume() {
 }
 
 #[tokio::test]
+async fn a_tile_without_a_name_or_of_an_absurd_scale() {
+    let what = refused(|scope| scope.tile(" ", 0, SIZE, 3)).await;
+    says(&what, &["no name"]);
+    for scale in [1000.0, 1e-4] {
+        let what = refused(|scope| {
+            scope.image("vast", SIZE, 3);
+            let Record::Tile(mut record) = tile_record("vast", 0, SIZE) else {
+                unreachable!()
+            };
+            let elements = [scale, 0.0, 0.0, scale, 0.0, 0.0];
+            record.transform = saccade_core::transform::SectionFromTile::new(elements).unwrap();
+            scope.say(&Record::Tile(record));
+        })
+        .await;
+        says(&what, &["512 voxels", "check the transform"]);
+    }
+}
+
+#[tokio::test]
 async fn a_record_of_another_size() {
     let what = refused(|scope| {
         scope.image("small", SIZE, 3);

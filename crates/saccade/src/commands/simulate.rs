@@ -10,7 +10,7 @@ use saccade_ingest::simulate::stack::PhantomStack;
 use saccade_ingest::simulate::{Corrections, SimulateConfig};
 
 use super::subject::Subject;
-use crate::arguments::{Rate, extent, rate, size, volume_name, voxel_nm};
+use crate::arguments::{Rate, degrees, extent, pixels, rate, size, volume_name, voxel_nm};
 use crate::interrupt::cancel_when_interrupted;
 use crate::progress::Shown;
 use crate::report::say;
@@ -64,15 +64,15 @@ pub(crate) struct Microscope {
     overlap: Option<f64>,
 
     /// Standard deviation of a tile's shift [pixels] [default: 24]
-    #[arg(long, value_name = "PIXELS")]
+    #[arg(long, value_name = "PIXELS", value_parser = pixels)]
     jitter: Option<f64>,
 
     /// Standard deviation of a tile's rotation [degrees] [default: 0.5]
-    #[arg(long, value_name = "DEGREES")]
+    #[arg(long, value_name = "DEGREES", value_parser = degrees)]
     rotation: Option<f64>,
 
     /// Standard deviation of what the stage gets wrong [pixels] [default: 0]
-    #[arg(long, value_name = "PIXELS")]
+    #[arg(long, value_name = "PIXELS", value_parser = pixels)]
     stage_error: Option<f64>,
 
     /// When the true transforms follow the stage's [default: never]
