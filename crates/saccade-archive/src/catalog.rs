@@ -1,14 +1,16 @@
 //! The catalog: which volumes and tiles there are, where they lie, and what changed.
 //!
-//! One SQLite file (write-ahead log, `synchronous=FULL`): when a commit returns, it survives a
-//! power cut. Several processes may have it open; one writes at a time and the others wait.
+//! One SQLite file (write-ahead log, `synchronous=FULL`), or a PostgreSQL database
+//! (`synchronous_commit=on`): when a commit returns, it survives a power cut. Several processes may
+//! have it open, with PostgreSQL on several machines; commits to one volume take turns.
 //!
 //! # Revisions
 //!
 //! Each volume has a revision, from 0. Each change of voxels makes it one larger and is logged with
 //! the box of level-0 voxels it touches. A tile that moves far makes two changes, its old and its
 //! new place, in one transaction. [`Catalog::subscribe`] tells of new revisions, also of those that
-//! other processes commit; [`Catalog::changes_after`] tells what they were.
+//! other processes commit; [`Catalog::changes_after`] tells what they were. The newest are kept, see
+//! [`CHANGES_KEPT`]; who was away for longer is told that anything may have changed.
 //!
 //! # Order
 //!
@@ -17,15 +19,26 @@
 //! record with the largest. A transform that comes before the tile's first record is kept and
 //! applied to it. A deletion ends what came before it: a tile record with a larger position brings
 //! the tile back, as if it were new.
+//!
+//! # Workers
+//!
+//! Records whose image is still to be worked on wait in the catalog. Any number of workers claim them,
+//! each record by one of them, and tell from time to time that they live. What a dead one had claimed
+//! is free again when its lease is over. See [`Catalog::claim`].
 
+mod clock;
 mod commit;
+mod database;
 mod error;
-mod open;
+mod location;
+mod postgres;
 mod rows;
+mod sqlite;
 mod watcher;
+mod workers;
 
-use std::path::Path;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::SystemTime;
 
 use glam::{DVec3, UVec2, UVec3};
@@ -33,16 +46,23 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Volume, check_name};
 use saccade_core::voxel_box::VoxelBox;
 use serde::{Deserialize, Serialize};
-use sqlx::SqlitePool;
 use tokio::sync::watch;
 
 use crate::acquisition::{Cursor, TileRecord};
 
+use database::{Database, Durability, Row, Statement, Transaction, Value};
+
+pub use clock::{Clock, SystemClock};
 pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
 pub use error::CatalogError;
+pub use location::CatalogLocation;
+pub use workers::{Claim, Worker};
 
 /// Most changes that [`Catalog::changes_after`] returns at once.
 pub const CHANGES_AT_ONCE: usize = 4096;
+
+/// Changes that are kept of each volume, at least: the newest.
+pub const CHANGES_KEPT: u64 = 1 << 16;
 
 /// Names a tile within its catalog, for good.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -175,6 +195,8 @@ pub struct Statistics {
     pub quarantined: u64,
     /// Tiles whose file is not whole yet.
     pub waiting: u64,
+    /// Tiles that were announced and are still to be worked on, or are being worked on.
+    pub queued: u64,
     /// Transforms whose tile has not come yet.
     pub early: u64,
 }
@@ -205,12 +227,11 @@ pub struct Catalog {
 
 #[derive(Debug)]
 struct Inner {
-    path: Box<Path>,
-    access: open::Access,
-    /// One connection: SQLite lets one write at a time, and waiting here costs no time-out.
-    writer: Option<SqlitePool>,
-    readers: SqlitePool,
+    location: CatalogLocation,
+    database: Database,
     watcher: watcher::Watcher,
+    clock: OnceLock<Arc<dyn Clock>>,
+    changes_kept: AtomicU64,
 }
 
 impl Catalog {
@@ -223,51 +244,69 @@ impl Catalog {
     /// # Errors
     ///
     /// [`CatalogError::NotFound`], [`CatalogError::NotACatalog`], [`CatalogError::NewerSchema`],
-    /// [`CatalogError::OlderSchema`], [`CatalogError::NetworkFilesystem`], or what SQLite says.
-    pub async fn open(path: &Path) -> Result<Self, CatalogError> {
-        if !path.is_file() {
-            return Err(CatalogError::NotFound {
-                path: path.to_owned(),
-            });
+    /// [`CatalogError::OlderSchema`], [`CatalogError::NetworkFilesystem`], [`CatalogError::Address`],
+    /// [`CatalogError::Unreachable`], [`CatalogError::NotDurable`], or what the database says.
+    pub async fn open(location: impl Into<CatalogLocation>) -> Result<Self, CatalogError> {
+        let location = location.into();
+        match &location {
+            CatalogLocation::File(path) if !path.is_file() => {
+                Err(CatalogError::NotFound { location })
+            }
+            _ => Self::connect(location, false).await,
         }
-        Self::create(path).await
     }
 
-    /// Opens a catalog, and makes it first if there is none.
+    /// Opens a catalog, and makes it first if there is none: a file, or the tables in an empty
+    /// database that the server has.
     ///
     /// # Errors
     ///
     /// As [`Self::open`].
-    pub async fn create(path: &Path) -> Result<Self, CatalogError> {
-        Ok(Self::of(path, open::open(path).await?))
+    pub async fn create(location: impl Into<CatalogLocation>) -> Result<Self, CatalogError> {
+        Self::connect(location.into(), true).await
     }
 
-    fn of(path: &Path, opened: open::Opened) -> Self {
+    async fn connect(location: CatalogLocation, create: bool) -> Result<Self, CatalogError> {
+        let database = match &location {
+            CatalogLocation::File(path) => Database::Sqlite(sqlite::open(path).await?),
+            CatalogLocation::Postgres(url) => {
+                Database::Postgres(postgres::open(url, create).await?)
+            }
+        };
+        Ok(Self::of(location, database))
+    }
+
+    fn of(location: CatalogLocation, database: Database) -> Self {
         let inner = Inner {
-            path: path.into(),
-            access: opened.access,
-            writer: opened.writer,
-            readers: opened.readers,
+            location,
+            database,
             watcher: watcher::Watcher::default(),
+            clock: OnceLock::new(),
+            changes_kept: AtomicU64::new(CHANGES_KEPT),
         };
         Self {
             inner: Arc::new(inner),
         }
     }
 
-    /// The connection that writes.
-    fn writer(&self) -> Result<&SqlitePool, CatalogError> {
-        self.inner
-            .writer
-            .as_ref()
-            .ok_or_else(|| CatalogError::ReadOnly {
-                path: self.path().to_owned(),
-            })
+    /// Where it is.
+    pub fn location(&self) -> &CatalogLocation {
+        &self.inner.location
     }
 
-    /// The file.
-    pub fn path(&self) -> &Path {
-        &self.inner.path
+    /// Measures leases with this clock instead of the machine's or, with a server, the server's. Has
+    /// an effect once.
+    #[must_use]
+    pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
+        drop(self.inner.clock.set(clock));
+        self
+    }
+
+    /// Keeps at least so many changes of each volume, instead of [`CHANGES_KEPT`].
+    #[must_use]
+    pub fn with_changes_kept(self, count: u64) -> Self {
+        self.inner.changes_kept.store(count, Ordering::Relaxed);
+        self
     }
 
     /// Enters a volume. It is fine if it is there already and has the same size.
@@ -275,17 +314,16 @@ impl Catalog {
     /// # Errors
     ///
     /// [`CatalogError::VolumeName`], [`CatalogError::WrongExtent`],
-    /// [`CatalogError::WrongVoxelSize`], or what SQLite says.
+    /// [`CatalogError::WrongVoxelSize`], or what the database says.
     pub async fn create_volume(&self, volume: &Volume) -> Result<(), CatalogError> {
         check_name(&volume.name)?;
-        let description = serde_json::to_string(volume).expect("a volume becomes JSON");
-        sqlx::query("INSERT INTO volumes (name, description) VALUES (?, ?) ON CONFLICT DO NOTHING")
-            .bind(&volume.name)
-            .bind(description)
-            .execute(self.writer()?)
-            .await
-            .map_err(|e| self.failed(e))?;
-        let there = self.volume(&volume.name).await?;
+        let there = match self.volume(&volume.name).await {
+            Err(CatalogError::UnknownVolume { .. }) => {
+                self.insert_volume(volume).await?;
+                self.volume(&volume.name).await?
+            }
+            there => there?,
+        };
         let name = volume.name.clone();
         if there.extent() != volume.extent() {
             let (existing, asked) = (there.extent(), volume.extent());
@@ -306,11 +344,22 @@ impl Catalog {
         Ok(())
     }
 
+    async fn insert_volume(&self, volume: &Volume) -> Result<(), CatalogError> {
+        let description = serde_json::to_string(volume).expect("a volume becomes JSON");
+        let insert =
+            "INSERT INTO volumes (name, description) VALUES ($1, $2) ON CONFLICT DO NOTHING";
+        let mut transaction = self.transaction(Durability::Durable).await?;
+        let values = [(&volume.name).into(), (&description).into()];
+        let done = transaction.run(insert, &values).await;
+        done.map_err(|e| self.failed(e))?;
+        transaction.commit().await.map_err(|e| self.failed(e))
+    }
+
     /// A volume.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn volume(&self, name: &str) -> Result<Volume, CatalogError> {
         Ok(self.entry(name).await?.volume)
     }
@@ -319,15 +368,14 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn entry(&self, name: &str) -> Result<VolumeEntry, CatalogError> {
-        let row = sqlx::query("SELECT description, revision, tiles FROM volumes WHERE name = ?")
-            .bind(name)
-            .fetch_optional(&self.inner.readers)
-            .await
-            .map_err(|e| self.failed(e))?;
-        match row {
-            Some(row) => rows::volume_entry(&row).map_err(|e| self.failed(e)),
+        let question = "SELECT description, revision, tiles FROM volumes WHERE name = $1";
+        let found = self
+            .ask(question, &[name.into()], rows::volume_entry)
+            .await?;
+        match found.into_iter().next() {
+            Some(entry) => Ok(entry),
             None => Err(self.unknown_volume(name).await),
         }
     }
@@ -336,96 +384,77 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
     pub async fn volumes(&self) -> Result<Vec<VolumeEntry>, CatalogError> {
-        let query = "SELECT description, revision, tiles FROM volumes ORDER BY name";
-        let rows = sqlx::query(query).fetch_all(&self.inner.readers).await;
-        let rows = rows.map_err(|e| self.failed(e))?;
-        let volumes: Result<_, _> = rows.iter().map(rows::volume_entry).collect();
-        volumes.map_err(|e| self.failed(e))
+        let question = "SELECT description, revision, tiles FROM volumes ORDER BY name";
+        self.ask(question, &[], rows::volume_entry).await
     }
 
     /// The tiles of a section, by id.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn section_tiles(&self, volume: &str, z: u32) -> Result<Vec<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, pyramid, revision \
-                     FROM tiles WHERE volume = ? AND section = ? AND deleted = 0 ORDER BY id";
-        let rows = sqlx::query(query)
-            .bind(id)
-            .bind(z)
-            .fetch_all(&self.inner.readers)
-            .await;
-        let rows = rows.map_err(|e| self.failed(e))?;
-        let tiles: Result<_, _> = rows.iter().map(rows::tile).collect();
-        tiles.map_err(|e| self.failed(e))
+        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                        pyramid, revision FROM tiles \
+                        WHERE volume = $1 AND section = $2 AND deleted = 0 ORDER BY id";
+        self.ask(question, &[id.into(), z.into()], rows::tile).await
     }
 
     /// The tile of that name, if the volume has it.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn tile(&self, volume: &str, name: &str) -> Result<Option<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, pyramid, revision \
-                     FROM tiles WHERE volume = ? AND name = ? AND deleted = 0";
-        let row = sqlx::query(query)
-            .bind(id)
-            .bind(name)
-            .fetch_optional(&self.inner.readers)
-            .await;
-        let row = row.map_err(|e| self.failed(e))?;
-        row.as_ref()
-            .map(rows::tile)
-            .transpose()
-            .map_err(|e| self.failed(e))
+        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                        pyramid, revision FROM tiles \
+                        WHERE volume = $1 AND name = $2 AND deleted = 0";
+        let values = [id.into(), name.into()];
+        Ok(self.ask(question, &values, rows::tile).await?.pop())
     }
 
     /// The tiles of these ids, by id; those that the volume has not are left out.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn tiles(&self, volume: &str, ids: &[TileId]) -> Result<Vec<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, pyramid, revision \
-                     FROM tiles WHERE id IN (SELECT value FROM json_each(?)) AND volume = ? \
-                     AND deleted = 0 ORDER BY id";
+        let question = Statement {
+            sqlite: "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                     pyramid, revision FROM tiles \
+                     WHERE id IN (SELECT value FROM json_each($1)) AND volume = $2 \
+                     AND deleted = 0 ORDER BY id",
+            postgres: "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                       pyramid, revision FROM tiles \
+                       WHERE id IN (SELECT value::bigint FROM json_array_elements_text($1::text::json)) \
+                       AND volume = $2 AND deleted = 0 ORDER BY id",
+        };
         let ids = serde_json::to_string(ids).expect("numbers become JSON");
-        let rows = sqlx::query(query)
-            .bind(ids)
-            .bind(id)
-            .fetch_all(&self.inner.readers)
-            .await;
-        let rows = rows.map_err(|e| self.failed(e))?;
-        let tiles: Result<_, _> = rows.iter().map(rows::tile).collect();
-        tiles.map_err(|e| self.failed(e))
+        self.ask(question, &[(&ids).into(), id.into()], rows::tile)
+            .await
     }
 
     /// The sections that have a tile, ascending.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn sections(&self, volume: &str) -> Result<Vec<u32>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT section FROM sections WHERE volume = ? ORDER BY section";
-        let sections = sqlx::query_scalar(query)
-            .bind(id)
-            .fetch_all(&self.inner.readers)
-            .await;
-        sections.map_err(|e| self.failed(e))
+        let question = "SELECT section FROM sections WHERE volume = $1 ORDER BY section";
+        self.ask(question, &[id.into()], rows::section).await
     }
 
     /// A volume's newest revision; 0 while it is empty.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn revision(&self, volume: &str) -> Result<u64, CatalogError> {
         Ok(self.entry(volume).await?.revision)
     }
@@ -435,31 +464,36 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::Missed`] where some of them are no longer kept: anything may have changed.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn changes_after(
         &self,
         volume: &str,
         revision: u64,
     ) -> Result<Vec<CatalogChange>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT revision, tile, section, x0, y0, x1, y1, reason FROM changes \
-                     WHERE volume = ? AND revision > ? ORDER BY revision LIMIT ?";
-        let query = sqlx::query(query).bind(id).bind(rows::signed(revision));
-        let rows = query
-            .bind(CHANGES_AT_ONCE as i64)
-            .fetch_all(&self.inner.readers)
-            .await;
-        let rows = rows.map_err(|e| self.failed(e))?;
-        let changes: Result<_, _> = rows.iter().map(rows::change).collect();
-        changes.map_err(|e| self.failed(e))
+        let question = "SELECT revision, tile, section, x0, y0, x1, y1, reason FROM changes \
+                        WHERE volume = $1 AND revision > $2 ORDER BY revision LIMIT $3";
+        let values = [id.into(), revision.into(), (CHANGES_AT_ONCE as u64).into()];
+        let changes = self.ask(question, &values, rows::change).await?;
+        match changes.first() {
+            // Each change has a revision of its own, so that a gap shows.
+            Some(oldest) if oldest.revision > revision + 1 => Err(CatalogError::Missed {
+                name: volume.to_owned(),
+                after: revision,
+                kept_after: oldest.revision - 1,
+                revision: self.revision(volume).await?,
+            }),
+            _ => Ok(changes),
+        }
     }
 
-    /// Follows a volume's revision: the receiver wakes after each commit of this process, and
-    /// within a fifth of a second after those of others.
+    /// Follows a volume's revision: the receiver wakes after each commit of this process, and within
+    /// a fifth of a second after those of others. A server that is away is waited for.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn subscribe(&self, volume: &str) -> Result<watch::Receiver<u64>, CatalogError> {
         // The receiver exists before the revision is read, so that no commit falls in between.
         let receiver = self.inner.watcher.subscribe(&self.inner, volume);
@@ -472,7 +506,7 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::ReadOnly`], or what the database says.
     pub async fn begin(&self, volume: &str) -> Result<Commit<'_>, CatalogError> {
         Commit::begin(self, volume).await
     }
@@ -531,7 +565,7 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn quarantine(&self, volume: &str, what: &Quarantined) -> Result<(), CatalogError> {
         let mut commit = self.begin(volume).await?;
         commit.quarantine(what).await?;
@@ -543,60 +577,43 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn quarantined(&self, volume: &str) -> Result<Vec<Quarantined>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query =
-            "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = ? ORDER BY id";
-        let rows = sqlx::query(query)
-            .bind(id)
-            .fetch_all(&self.inner.readers)
-            .await;
-        let rows = rows.map_err(|e| self.failed(e))?;
-        let files: Result<_, _> = rows.iter().map(rows::quarantined).collect();
-        files.map_err(|e| self.failed(e))
+        let question =
+            "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = $1 ORDER BY id";
+        self.ask(question, &[id.into()], rows::quarantined).await
     }
 
     /// How far the records were read.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn cursor(&self, volume: &str) -> Result<Cursor, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query = "SELECT byte, line FROM cursors WHERE volume = ?";
-        let row = sqlx::query(query)
-            .bind(id)
-            .fetch_optional(&self.inner.readers)
-            .await;
-        let row = row.map_err(|e| self.failed(e))?;
-        row.map_or_else(|| Ok(Cursor::default()), |r| rows::cursor(&r))
-            .map_err(|e| self.failed(e))
+        let question = "SELECT byte, line FROM cursors WHERE volume = $1";
+        let found = self.ask(question, &[id.into()], rows::cursor).await?;
+        Ok(found.into_iter().next().unwrap_or_default())
     }
 
     /// The records whose file is not whole yet, by position.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn waiting(&self, volume: &str) -> Result<Vec<Waiting>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query =
-            "SELECT position, record, reason FROM waiting WHERE volume = ? ORDER BY position";
-        let rows = sqlx::query(query)
-            .bind(id)
-            .fetch_all(&self.inner.readers)
-            .await;
-        let rows = rows.map_err(|e| self.failed(e))?;
-        let waiting: Result<_, _> = rows.iter().map(rows::waiting).collect();
-        waiting.map_err(|e| self.failed(e))
+        let question = "SELECT position, record, reason FROM waiting \
+                        WHERE volume = $1 AND parked = 1 ORDER BY position";
+        self.ask(question, &[id.into()], rows::waiting).await
     }
 
     /// Pyramids that no tile has named since `before`, at most `max`.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn retired(
         &self,
         volume: &str,
@@ -604,79 +621,83 @@ impl Catalog {
         max: u32,
     ) -> Result<Vec<Retired>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let query =
-            "SELECT pyramid, at FROM retired WHERE volume = ? AND at < ? ORDER BY at LIMIT ?";
-        let query = sqlx::query(query)
-            .bind(id)
-            .bind(rows::millis(before))
-            .bind(max);
-        let rows = query
-            .fetch_all(&self.inner.readers)
-            .await
-            .map_err(|e| self.failed(e))?;
-        let retired: Result<_, _> = rows.iter().map(rows::retired).collect();
-        retired.map_err(|e| self.failed(e))
+        let question =
+            "SELECT pyramid, at FROM retired WHERE volume = $1 AND at < $2 ORDER BY at LIMIT $3";
+        let values = [id.into(), rows::millis(before).into(), max.into()];
+        self.ask(question, &values, rows::retired).await
     }
 
     /// Counts. Cheap at any number of tiles.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what SQLite says.
+    /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn statistics(&self, volume: &str) -> Result<Statistics, CatalogError> {
-        let entry = self.entry(volume).await?;
-        let id = self.volume_id(volume).await?;
-        let count = "SELECT (SELECT count(*) FROM quarantine WHERE volume = ?1), \
-                     (SELECT count(*) FROM waiting WHERE volume = ?1), \
-                     (SELECT count(*) FROM early_transforms WHERE volume = ?1), \
-                     (SELECT count(*) FROM sections WHERE volume = ?1)";
-        let counts = sqlx::query_as::<_, (i64, i64, i64, i64)>(count).bind(id);
-        let counts = counts
-            .fetch_one(&self.inner.readers)
-            .await
-            .map_err(|e| self.failed(e))?;
-        Ok(Statistics {
-            revision: entry.revision,
-            tiles: entry.tiles,
-            sections: counts.3.unsigned_abs(),
-            quarantined: counts.0.unsigned_abs(),
-            waiting: counts.1.unsigned_abs(),
-            early: counts.2.unsigned_abs(),
-        })
+        let question = "SELECT v.revision, v.tiles, \
+                        (SELECT count(*) FROM sections WHERE volume = v.id) AS sections, \
+                        (SELECT count(*) FROM quarantine WHERE volume = v.id) AS quarantined, \
+                        (SELECT count(*) FROM waiting WHERE volume = v.id AND parked = 1) AS waiting, \
+                        (SELECT count(*) FROM waiting WHERE volume = v.id AND parked = 0) AS queued, \
+                        (SELECT count(*) FROM early_transforms WHERE volume = v.id) AS early \
+                        FROM volumes v WHERE v.name = $1";
+        let found = self
+            .ask(question, &[volume.into()], rows::statistics)
+            .await?;
+        match found.into_iter().next() {
+            Some(statistics) => Ok(statistics),
+            None => Err(self.unknown_volume(volume).await),
+        }
     }
 
     /// Ends all connections. Without it they end when the last clone is dropped, in their own time.
     pub async fn close(&self) {
-        self.inner.readers.close().await;
-        if let Some(writer) = &self.inner.writer {
-            writer.close().await;
-        }
+        self.inner.database.close().await;
+    }
+
+    /// Asks, and understands each row of the answer.
+    async fn ask<T>(
+        &self,
+        question: impl Into<Statement>,
+        values: &[Value<'_>],
+        understand: impl Fn(&Row) -> Result<T, sqlx::Error>,
+    ) -> Result<Vec<T>, CatalogError> {
+        let rows = self.inner.database.all(question, values).await;
+        let rows = rows.and_then(|rows| rows.iter().map(understand).collect());
+        rows.map_err(|e| self.failed(e))
+    }
+
+    async fn transaction(&self, durability: Durability) -> Result<Transaction, CatalogError> {
+        let begun = Transaction::begin(&self.inner.database, durability).await;
+        begun
+            .map_err(|e| self.failed(e))?
+            .ok_or_else(|| CatalogError::ReadOnly {
+                location: self.location().clone(),
+            })
     }
 
     async fn volume_id(&self, name: &str) -> Result<i64, CatalogError> {
-        let query = sqlx::query_scalar("SELECT id FROM volumes WHERE name = ?").bind(name);
-        let id = query
-            .fetch_optional(&self.inner.readers)
-            .await
-            .map_err(|e| self.failed(e))?;
-        match id {
+        let question = "SELECT id FROM volumes WHERE name = $1";
+        let found = self
+            .ask(question, &[name.into()], |row| row.get("id"))
+            .await?;
+        match found.into_iter().next() {
             Some(id) => Ok(id),
             None => Err(self.unknown_volume(name).await),
         }
     }
 
     async fn unknown_volume(&self, name: &str) -> CatalogError {
-        let query = sqlx::query_scalar("SELECT name FROM volumes ORDER BY name");
-        match query.fetch_all(&self.inner.readers).await {
+        let question = "SELECT name FROM volumes ORDER BY name";
+        match self.ask(question, &[], |row| row.get("name")).await {
             Ok(known) => CatalogError::UnknownVolume {
                 name: name.to_owned(),
                 known,
             },
-            Err(e) => self.failed(e),
+            Err(e) => e,
         }
     }
 
     fn failed(&self, source: sqlx::Error) -> CatalogError {
-        CatalogError::from_sqlite(source, &self.inner.path)
+        CatalogError::sort(source, &self.inner.location)
     }
 }

@@ -196,7 +196,7 @@ impl StitchedSource {
         let catalog = archive.catalog().clone();
         let open_error = |error: StitchError| SourceError::Open {
             source: Arc::new(error),
-            location: catalog.path().display().to_string(),
+            location: catalog.location().to_string(),
         };
         let failed = |source| open_error(StitchError::Catalog { source });
         // The watch exists before the revision is read, so that no change falls in between.

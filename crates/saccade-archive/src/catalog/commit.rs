@@ -1,15 +1,17 @@
 //! One transaction: everything in it happens, or nothing.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
 use std::time::SystemTime;
 
 use glam::UVec3;
 use saccade_core::transform::SectionFromTile;
 use saccade_core::voxel_box::VoxelBox;
-use sqlx::{Row, Sqlite, Transaction};
 
+use super::database::{Durability, Row, Statement, Transaction, Value};
 use super::{
-    Catalog, CatalogError, ChangeReason, NewTile, Quarantined, TileId, Waiting, place, rows,
+    Catalog, CatalogError, ChangeReason, NewTile, Quarantined, TileId, Waiting, Worker, place,
+    postgres, rows,
 };
 use crate::acquisition::Cursor;
 
@@ -52,7 +54,7 @@ pub enum DeleteOutcome {
 #[derive(Debug)]
 pub struct Commit<'c> {
     catalog: &'c Catalog,
-    transaction: Transaction<'static, Sqlite>,
+    transaction: Transaction,
     volume: i64,
     name: String,
     extent: UVec3,
@@ -78,22 +80,23 @@ struct Existing {
 
 impl<'c> Commit<'c> {
     pub(super) async fn begin(catalog: &'c Catalog, volume: &str) -> Result<Self, CatalogError> {
-        // IMMEDIATE: a transaction that begins by reading could not always go on to write.
-        let begun = catalog.writer()?.begin_with("BEGIN IMMEDIATE").await;
-        let mut transaction = begun.map_err(|e| catalog.failed(e))?;
-        let query = "SELECT id, description, revision, tiles FROM volumes WHERE name = ?";
-        let row = sqlx::query(query)
-            .bind(volume)
-            .fetch_optional(&mut *transaction)
-            .await;
+        let mut transaction = catalog.transaction(Durability::Durable).await?;
+        // Whoever comes later waits here, so that revisions follow one another.
+        let question = Statement {
+            sqlite: "SELECT id, description, revision, tiles FROM volumes WHERE name = $1",
+            postgres: "SELECT id, description, revision, tiles FROM volumes WHERE name = $1 \
+                       FOR NO KEY UPDATE",
+        };
+        let row = transaction.one(question, &[volume.into()]).await;
         let Some(row) = row.map_err(|e| catalog.failed(e))? else {
+            drop(transaction);
             return Err(catalog.unknown_volume(volume).await);
         };
         let entry = rows::volume_entry(&row).map_err(|e| catalog.failed(e))?;
         Ok(Self {
             catalog,
             transaction,
-            volume: row.try_get("id").map_err(|e| catalog.failed(e))?,
+            volume: row.get("id").map_err(|e| catalog.failed(e))?,
             name: volume.to_owned(),
             extent: entry.volume.extent(),
             before: entry.revision,
@@ -107,7 +110,7 @@ impl<'c> Commit<'c> {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::OutsideVolume`] if no voxel is under it; what SQLite says.
+    /// [`CatalogError::OutsideVolume`] if no voxel is under it; what the database says.
     pub async fn tile(
         &mut self,
         tile: &NewTile,
@@ -151,27 +154,23 @@ impl<'c> Commit<'c> {
         let old = existing.as_ref().and_then(|e| e.place);
         self.log_change(id, old, Some(place), ChangeReason::Tile)
             .await?;
-        let query = "UPDATE tiles SET deleted = 0, section = ?, channel = ?, \
-                     width = ?, height = ?, a = ?, b = ?, c = ?, d = ?, tx = ?, ty = ?, \
-                     pyramid = ?, revision = ?, position = ?, transform_position = ? WHERE id = ?";
-        let mut query = sqlx::query(query)
-            .bind(tile.section)
-            .bind(tile.channel)
-            .bind(tile.size.x)
-            .bind(tile.size.y);
-        for element in transform.elements() {
-            query = query.bind(element);
-        }
-        let query = query
-            .bind(&tile.pyramid)
-            .bind(rows::signed(self.revision))
-            .bind(rows::signed(tile.position))
-            .bind(rows::signed(transform_position))
-            .bind(id.0);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let update = "UPDATE tiles SET deleted = 0, section = $2, channel = $3, width = $4, \
+                      height = $5, pyramid = $6, revision = $7, position = $8, \
+                      transform_position = $9, a = $10, b = $11, c = $12, d = $13, tx = $14, \
+                      ty = $15 WHERE id = $1";
+        let mut values = vec![
+            id.0.into(),
+            tile.section.into(),
+            tile.channel.into(),
+            tile.size.x.into(),
+            tile.size.y.into(),
+            (&tile.pyramid).into(),
+            self.revision.into(),
+            tile.position.into(),
+            transform_position.into(),
+        ];
+        values.extend(transform.elements().map(Value::from));
+        self.run(update, &values).await?;
         self.end_quarantine(&tile.name).await?;
         let Some(existing) = existing else {
             return Ok(TileOutcome::New);
@@ -190,7 +189,7 @@ impl<'c> Commit<'c> {
     /// # Errors
     ///
     /// [`CatalogError::OutsideVolume`] if no voxel would be under the tile, which then stays where
-    /// it is; what SQLite says.
+    /// it is; what the database says.
     pub async fn transform(
         &mut self,
         tile: &str,
@@ -217,24 +216,15 @@ impl<'c> Commit<'c> {
             let reason = ChangeReason::Transform;
             self.log_change(existing.id, existing.place, Some(place), reason)
                 .await?;
-            let query = "UPDATE tiles SET a = ?, b = ?, c = ?, d = ?, tx = ?, ty = ?, revision = ? \
-                         WHERE id = ?";
-            let mut query = sqlx::query(query);
-            for element in transform.elements() {
-                query = query.bind(element);
-            }
-            let query = query.bind(rows::signed(self.revision)).bind(existing.id.0);
-            query
-                .execute(&mut *self.transaction)
-                .await
-                .map_err(|e| self.catalog.failed(e))?;
+            let update = "UPDATE tiles SET revision = $2, a = $3, b = $4, c = $5, d = $6, tx = $7, \
+                          ty = $8 WHERE id = $1";
+            let mut values = vec![existing.id.0.into(), self.revision.into()];
+            values.extend(transform.elements().map(Value::from));
+            self.run(update, &values).await?;
         }
-        let query = sqlx::query("UPDATE tiles SET transform_position = ? WHERE id = ?");
-        let query = query.bind(rows::signed(position)).bind(existing.id.0);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let update = "UPDATE tiles SET transform_position = $2 WHERE id = $1";
+        self.run(update, &[existing.id.0.into(), position.into()])
+            .await?;
         Ok(if moved {
             TransformOutcome::Moved
         } else {
@@ -247,7 +237,7 @@ impl<'c> Commit<'c> {
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
     pub async fn delete(
         &mut self,
         tile: &str,
@@ -258,13 +248,10 @@ impl<'c> Commit<'c> {
         if existing.as_ref().is_some_and(|e| e.position > position) {
             return Ok(DeleteOutcome::Unchanged);
         }
-        let query = "DELETE FROM early_transforms WHERE volume = ? AND tile = ? AND position <= ?";
-        let query = sqlx::query(query).bind(self.volume).bind(tile);
-        query
-            .bind(rows::signed(position))
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let ended = "DELETE FROM early_transforms \
+                     WHERE volume = $1 AND tile = $2 AND position <= $3";
+        let values = [self.volume.into(), tile.into(), position.into()];
+        self.run(ended, &values).await?;
         self.end_quarantine(tile).await?;
         let (id, outcome) = match existing {
             None => (self.insert_name(tile).await?, DeleteOutcome::Noted),
@@ -281,37 +268,24 @@ impl<'c> Commit<'c> {
                 (e.id, DeleteOutcome::Deleted)
             }
         };
-        let query = "UPDATE tiles SET deleted = 1, pyramid = '', position = ?, revision = ? \
-                     WHERE id = ?";
-        let query = sqlx::query(query)
-            .bind(rows::signed(position))
-            .bind(rows::signed(self.revision))
-            .bind(id.0);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let update = "UPDATE tiles SET deleted = 1, pyramid = '', position = $2, revision = $3 \
+                      WHERE id = $1";
+        let values = [id.0.into(), position.into(), self.revision.into()];
+        self.run(update, &values).await?;
         Ok(outcome)
     }
 
     async fn end_quarantine(&mut self, tile: &str) -> Result<(), CatalogError> {
-        let query = sqlx::query("DELETE FROM quarantine WHERE volume = ? AND tile = ?");
-        let query = query.bind(self.volume).bind(tile);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2";
+        self.run(end, &[self.volume.into(), tile.into()]).await?;
         Ok(())
     }
 
     async fn retire(&mut self, pyramid: &str, now: SystemTime) -> Result<(), CatalogError> {
-        let query = "INSERT OR REPLACE INTO retired (pyramid, volume, at) VALUES (?, ?, ?)";
-        let query = sqlx::query(query).bind(pyramid).bind(self.volume);
-        let query = query.bind(rows::millis(now));
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let retire = "INSERT INTO retired (pyramid, volume, at) VALUES ($1, $2, $3) \
+                      ON CONFLICT (pyramid) DO UPDATE SET volume = excluded.volume, at = excluded.at";
+        let values = [pyramid.into(), self.volume.into(), rows::millis(now).into()];
+        self.run(retire, &values).await?;
         Ok(())
     }
 
@@ -319,21 +293,20 @@ impl<'c> Commit<'c> {
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
     pub async fn quarantine(&mut self, what: &Quarantined) -> Result<(), CatalogError> {
-        let query = "INSERT INTO quarantine (volume, file, tile, reason, bytes, at) \
-                     VALUES (?, ?, ?, ?, ?, ?)";
-        let query = sqlx::query(query)
-            .bind(self.volume)
-            .bind(&what.file)
-            .bind(&what.tile)
-            .bind(&what.reason)
-            .bind(what.bytes.map(rows::signed))
-            .bind(rows::millis(what.at));
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let insert = "INSERT INTO quarantine (volume, file, tile, reason, bytes, at) \
+                      VALUES ($1, $2, $3, $4, $5, $6)";
+        let bytes = what.bytes.map(|b| i64::try_from(b).unwrap_or(i64::MAX));
+        let values = [
+            self.volume.into(),
+            (&what.file).into(),
+            Value::MaybeText(what.tile.as_deref()),
+            (&what.reason).into(),
+            Value::MaybeInteger(bytes),
+            rows::millis(what.at).into(),
+        ];
+        self.run(insert, &values).await?;
         Ok(())
     }
 
@@ -341,54 +314,96 @@ impl<'c> Commit<'c> {
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
     pub async fn cursor(&mut self, cursor: Cursor) -> Result<(), CatalogError> {
-        let query = "INSERT OR REPLACE INTO cursors (volume, byte, line) VALUES (?, ?, ?)";
-        let query = sqlx::query(query)
-            .bind(self.volume)
-            .bind(rows::signed(cursor.offset))
-            .bind(rows::signed(cursor.line));
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let insert = "INSERT INTO cursors (volume, byte, line) VALUES ($1, $2, $3) \
+                      ON CONFLICT (volume) DO UPDATE SET byte = excluded.byte, line = excluded.line";
+        let values = [self.volume.into(), cursor.offset.into(), cursor.line.into()];
+        self.run(insert, &values).await?;
         Ok(())
     }
 
-    /// Remembers a record whose file is not whole yet.
+    /// Remembers that the records from one cursor to another were read, unless another worker did
+    /// so: then it is `false`, and nothing changed.
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
+    pub async fn advance(&mut self, from: Cursor, to: Cursor) -> Result<bool, CatalogError> {
+        let question = "SELECT byte, line FROM cursors WHERE volume = $1";
+        let row = self.one(question, &[self.volume.into()]).await?;
+        let now = row.as_ref().map(rows::cursor).transpose();
+        let now = now.map_err(|e| self.catalog.failed(e))?;
+        if now.unwrap_or_default() != from {
+            return Ok(false);
+        }
+        self.cursor(to).await?;
+        Ok(true)
+    }
+
+    /// Puts a record in the queue, for a worker to claim.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn enqueue(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
+        self.keep(waiting, 0).await
+    }
+
+    /// Remembers a record whose file is not whole yet. Whoever has claimed it keeps it.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
     pub async fn wait(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
+        self.keep(waiting, 1).await
+    }
+
+    async fn keep(&mut self, waiting: &Waiting, parked: u32) -> Result<(), CatalogError> {
         let record = serde_json::to_string(&waiting.record).expect("a record becomes JSON");
-        let query = "INSERT OR REPLACE INTO waiting (volume, position, tile, record, reason) \
-                     VALUES (?, ?, ?, ?, ?)";
-        let query = sqlx::query(query)
-            .bind(self.volume)
-            .bind(rows::signed(waiting.position))
-            .bind(&waiting.record.tile)
-            .bind(record)
-            .bind(&waiting.reason);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let keep = "INSERT INTO waiting (volume, position, tile, record, reason, parked) \
+                    VALUES ($1, $2, $3, $4, $5, $6) ON CONFLICT (volume, position) DO UPDATE SET \
+                    tile = excluded.tile, record = excluded.record, reason = excluded.reason, \
+                    parked = excluded.parked, attempts = 0";
+        let values = [
+            self.volume.into(),
+            waiting.position.into(),
+            (&waiting.record.tile).into(),
+            (&record).into(),
+            (&waiting.reason).into(),
+            parked.into(),
+        ];
+        self.run(keep, &values).await?;
         Ok(())
+    }
+
+    /// Whether a claimed record is still the worker's: if its lease was over for a while, another may
+    /// have it, or be done with it. What it became is then another's to say.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn holds(&mut self, worker: &Worker, position: u64) -> Result<bool, CatalogError> {
+        let question = Statement {
+            sqlite: "SELECT worker FROM waiting \
+                     WHERE volume = $1 AND position = $2 AND worker = $3",
+            // Until this transaction ends, nobody claims it.
+            postgres: "SELECT worker FROM waiting \
+                       WHERE volume = $1 AND position = $2 AND worker = $3 FOR UPDATE",
+        };
+        let values = [self.volume.into(), position.into(), worker.id.into()];
+        Ok(self.one(question, &values).await?.is_some())
     }
 
     /// Forgets a record that waited. It is no error if there is none.
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
     pub async fn wait_no_more(&mut self, position: u64) -> Result<(), CatalogError> {
-        let query = sqlx::query("DELETE FROM waiting WHERE volume = ? AND position = ?");
-        let query = query.bind(self.volume).bind(rows::signed(position));
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let forget = "DELETE FROM waiting WHERE volume = $1 AND position = $2";
+        self.run(forget, &[self.volume.into(), position.into()])
+            .await?;
         Ok(())
     }
 
@@ -396,13 +411,10 @@ impl<'c> Commit<'c> {
     ///
     /// # Errors
     ///
-    /// What SQLite says.
+    /// What the database says.
     pub async fn forget_retired(&mut self, pyramid: &str) -> Result<(), CatalogError> {
-        let query = sqlx::query("DELETE FROM retired WHERE pyramid = ?").bind(pyramid);
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        self.run("DELETE FROM retired WHERE pyramid = $1", &[pyramid.into()])
+            .await?;
         Ok(())
     }
 
@@ -410,25 +422,26 @@ impl<'c> Commit<'c> {
     ///
     /// # Errors
     ///
-    /// What SQLite says; nothing has changed then.
+    /// What the database says; nothing has changed then, except where a server was lost while it said
+    /// so: then look.
     pub async fn finish(mut self) -> Result<u64, CatalogError> {
         self.count_sections().await?;
         let changed = self.revision != self.before;
         if changed {
-            let query = "UPDATE volumes SET revision = ?, tiles = tiles + ? WHERE id = ?";
-            let query = sqlx::query(query)
-                .bind(rows::signed(self.revision))
-                .bind(self.sections.values().sum::<i64>())
-                .bind(self.volume);
-            query
-                .execute(&mut *self.transaction)
-                .await
-                .map_err(|e| self.catalog.failed(e))?;
+            self.forget_changes().await?;
+            let update = "UPDATE volumes SET revision = $2, tiles = tiles + $3 WHERE id = $1";
+            let more: i64 = self.sections.values().sum();
+            let values = [self.volume.into(), self.revision.into(), more.into()];
+            self.run(update, &values).await?;
+            if let Transaction::Postgres(_) = &self.transaction {
+                let told = format!("{} {}", self.revision, self.name);
+                let tell = "SELECT pg_notify($1, $2)";
+                self.run(tell, &[postgres::CHANNEL.into(), (&told).into()])
+                    .await?;
+            }
         }
-        self.transaction
-            .commit()
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let done = self.transaction.commit().await;
+        done.map_err(|e| self.catalog.failed(e))?;
         if changed {
             self.catalog
                 .inner
@@ -438,34 +451,59 @@ impl<'c> Commit<'c> {
         Ok(self.revision)
     }
 
+    /// Forgets old changes, some at a time.
+    async fn forget_changes(&mut self) -> Result<(), CatalogError> {
+        let kept = self.catalog.inner.changes_kept.load(Ordering::Relaxed);
+        let step = (kept / 16).max(1);
+        if self.before / step == self.revision / step || self.revision <= kept {
+            return Ok(());
+        }
+        let forget = "DELETE FROM changes WHERE volume = $1 AND revision <= $2";
+        let values = [self.volume.into(), (self.revision - kept).into()];
+        self.run(forget, &values).await?;
+        Ok(())
+    }
+
     async fn count_sections(&mut self) -> Result<(), CatalogError> {
-        for (section, more) in &self.sections {
-            let query = match more.signum() {
+        let sections = std::mem::take(&mut self.sections);
+        for (section, more) in &sections {
+            let count = match more.signum() {
                 0 => continue,
                 1 => {
-                    "INSERT INTO sections (volume, section, tiles) VALUES (?1, ?2, ?3) \
-                     ON CONFLICT (volume, section) DO UPDATE SET tiles = sections.tiles + ?3"
+                    "INSERT INTO sections (volume, section, tiles) VALUES ($1, $2, $3) \
+                     ON CONFLICT (volume, section) DO UPDATE SET tiles = sections.tiles + $3"
                 }
-                _ => "UPDATE sections SET tiles = tiles + ?3 WHERE volume = ?1 AND section = ?2",
+                _ => "UPDATE sections SET tiles = tiles + $3 WHERE volume = $1 AND section = $2",
             };
-            let query = sqlx::query(query)
-                .bind(self.volume)
-                .bind(section)
-                .bind(more);
-            query
-                .execute(&mut *self.transaction)
-                .await
-                .map_err(|e| self.catalog.failed(e))?;
+            let values = [self.volume.into(), (*section).into(), (*more).into()];
+            self.run(count, &values).await?;
+            if *more < 0 {
+                let forget = "DELETE FROM sections \
+                              WHERE volume = $1 AND section = $2 AND tiles = 0";
+                self.run(forget, &[self.volume.into(), (*section).into()])
+                    .await?;
+            }
         }
-        if self.sections.values().any(|more| *more < 0) {
-            let query = "DELETE FROM sections WHERE volume = ? AND tiles = 0";
-            let query = sqlx::query(query).bind(self.volume);
-            query
-                .execute(&mut *self.transaction)
-                .await
-                .map_err(|e| self.catalog.failed(e))?;
-        }
+        self.sections = sections;
         Ok(())
+    }
+
+    async fn run(
+        &mut self,
+        statement: &'static str,
+        values: &[Value<'_>],
+    ) -> Result<u64, CatalogError> {
+        let done = self.transaction.run(statement, values).await;
+        done.map_err(|e| self.catalog.failed(e))
+    }
+
+    async fn one(
+        &mut self,
+        question: impl Into<Statement>,
+        values: &[Value<'_>],
+    ) -> Result<Option<Row>, CatalogError> {
+        let row = self.transaction.one(question, values).await;
+        row.map_err(|e| self.catalog.failed(e))
     }
 
     fn place(
@@ -484,29 +522,30 @@ impl<'c> Commit<'c> {
     }
 
     async fn existing(&mut self, name: &str) -> Result<Option<Existing>, CatalogError> {
-        let query = "SELECT id, deleted, section, width, height, a, b, c, d, tx, ty, pyramid, position, \
-                     transform_position FROM tiles WHERE volume = ? AND name = ?";
-        let query = sqlx::query(query).bind(self.volume).bind(name);
-        let row = query.fetch_optional(&mut *self.transaction).await;
-        let Some(row) = row.map_err(|e| self.catalog.failed(e))? else {
+        let question = "SELECT id, deleted, section, width, height, a, b, c, d, tx, ty, pyramid, \
+                        position, transform_position FROM tiles WHERE volume = $1 AND name = $2";
+        let row = self
+            .one(question, &[self.volume.into(), name.into()])
+            .await?;
+        let Some(row) = row else {
             return Ok(None);
         };
         let extent = self.extent;
         let decode = || {
-            let deleted: bool = row.try_get("deleted")?;
+            let deleted = row.get::<i64>("deleted")? != 0;
             let (section, size, transform) = (
                 rows::section(&row)?,
                 rows::size(&row)?,
                 rows::transform(&row)?,
             );
             Ok(Existing {
-                id: TileId(row.try_get("id")?),
+                id: TileId(row.get("id")?),
                 deleted,
                 section,
                 place: place(extent, section, size, transform).filter(|_| !deleted),
                 transform,
                 size,
-                pyramid: row.try_get("pyramid")?,
+                pyramid: row.get("pyramid")?,
                 position: rows::unsigned(&row, "position")?,
                 transform_position: rows::unsigned(&row, "transform_position")?,
             })
@@ -516,15 +555,13 @@ impl<'c> Commit<'c> {
 
     /// A row for a new tile; the caller fills in the rest.
     async fn insert_name(&mut self, tile: &str) -> Result<TileId, CatalogError> {
-        let query = "INSERT INTO tiles (volume, name, section, width, height, a, b, c, d, tx, ty, \
-                     pyramid, revision, position, transform_position) \
-                     VALUES (?, ?, 0, 0, 0, 1, 0, 0, 1, 0, 0, '', 0, 0, 0)";
-        let query = sqlx::query(query).bind(self.volume).bind(tile);
-        let done = query.execute(&mut *self.transaction).await;
-        Ok(TileId(
-            done.map_err(|e| self.catalog.failed(e))?
-                .last_insert_rowid(),
-        ))
+        let insert = "INSERT INTO tiles (volume, name, section, width, height, a, b, c, d, tx, ty, \
+                      pyramid, revision, position, transform_position) \
+                      VALUES ($1, $2, 0, 0, 0, 1, 0, 0, 1, 0, 0, '', 0, 0, 0) RETURNING id";
+        let row = self.one(insert, &[self.volume.into(), tile.into()]).await?;
+        let id = row.ok_or(sqlx::Error::RowNotFound);
+        let id = id.and_then(|row| row.get("id"));
+        Ok(TileId(id.map_err(|e| self.catalog.failed(e))?))
     }
 
     /// Logs the places at which voxels changed, each with a revision of its own: two where the old
@@ -542,22 +579,20 @@ impl<'c> Commit<'c> {
         };
         for place in places {
             self.revision += 1;
-            let query = "INSERT INTO changes (volume, revision, tile, section, x0, y0, x1, y1, reason) \
-                         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)";
-            let query = sqlx::query(query)
-                .bind(self.volume)
-                .bind(rows::signed(self.revision))
-                .bind(tile.0)
-                .bind(place.min.z)
-                .bind(place.min.x)
-                .bind(place.min.y)
-                .bind(place.max.x)
-                .bind(place.max.y)
-                .bind(rows::reason(reason));
-            query
-                .execute(&mut *self.transaction)
-                .await
-                .map_err(|e| self.catalog.failed(e))?;
+            let log = "INSERT INTO changes (volume, revision, tile, section, x0, y0, x1, y1, reason) \
+                       VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9)";
+            let values = [
+                self.volume.into(),
+                self.revision.into(),
+                tile.0.into(),
+                place.min.z.into(),
+                place.min.x.into(),
+                place.min.y.into(),
+                place.max.x.into(),
+                place.max.y.into(),
+                rows::reason(reason).into(),
+            ];
+            self.run(log, &values).await?;
         }
         Ok(())
     }
@@ -568,20 +603,16 @@ impl<'c> Commit<'c> {
         transform: SectionFromTile,
         position: u64,
     ) -> Result<(), CatalogError> {
-        let query = "INSERT INTO early_transforms (volume, tile, a, b, c, d, tx, ty, position) \
-                     VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (volume, tile) DO UPDATE SET \
-                     a = excluded.a, b = excluded.b, c = excluded.c, d = excluded.d, \
-                     tx = excluded.tx, ty = excluded.ty, position = excluded.position \
-                     WHERE excluded.position >= position";
-        let mut query = sqlx::query(query).bind(self.volume).bind(tile);
-        for element in transform.elements() {
-            query = query.bind(element);
-        }
-        let query = query.bind(rows::signed(position));
-        query
-            .execute(&mut *self.transaction)
-            .await
-            .map_err(|e| self.catalog.failed(e))?;
+        let keep = "INSERT INTO early_transforms \
+                    (volume, tile, position, a, b, c, d, tx, ty) \
+                    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9) \
+                    ON CONFLICT (volume, tile) DO UPDATE SET \
+                    a = excluded.a, b = excluded.b, c = excluded.c, d = excluded.d, \
+                    tx = excluded.tx, ty = excluded.ty, position = excluded.position \
+                    WHERE excluded.position >= early_transforms.position";
+        let mut values = vec![self.volume.into(), tile.into(), position.into()];
+        values.extend(transform.elements().map(Value::from));
+        self.run(keep, &values).await?;
         Ok(())
     }
 
@@ -592,24 +623,26 @@ impl<'c> Commit<'c> {
         tile: &NewTile,
         deleted: Option<u64>,
     ) -> Result<Option<(SectionFromTile, u64)>, CatalogError> {
-        let query = "DELETE FROM early_transforms WHERE volume = ?1 AND tile = ?2 \
-                     RETURNING a, b, c, d, tx, ty, position, EXISTS (SELECT 1 FROM waiting \
-                       WHERE waiting.volume = ?1 AND waiting.tile = ?2 \
-                         AND waiting.position < ?3 AND waiting.position > ?4) AS older_waits";
-        let query = sqlx::query(query).bind(self.volume).bind(&tile.name);
-        let query = query
-            .bind(rows::signed(tile.position))
-            .bind(deleted.map_or(-1, rows::signed));
-        let row = query.fetch_optional(&mut *self.transaction).await;
-        let Some(row) = row.map_err(|e| self.catalog.failed(e))? else {
+        let take = "DELETE FROM early_transforms WHERE volume = $1 AND tile = $2 \
+                    RETURNING a, b, c, d, tx, ty, position, \
+                    (SELECT count(*) FROM waiting \
+                       WHERE waiting.volume = $1 AND waiting.tile = $2 \
+                         AND waiting.position < $3 AND waiting.position > $4) AS older_waiting";
+        let deleted = deleted.map_or(-1, |p| i64::try_from(p).unwrap_or(i64::MAX));
+        let values = [
+            self.volume.into(),
+            (&tile.name).into(),
+            tile.position.into(),
+            deleted.into(),
+        ];
+        let Some(row) = self.one(take, &values).await? else {
             return Ok(None);
         };
         let decode = || {
-            let older_waits: bool = row.try_get("older_waits")?;
             Ok((
                 rows::transform(&row)?,
                 rows::unsigned(&row, "position")?,
-                older_waits,
+                row.get::<i64>("older_waiting")? > 0,
             ))
         };
         let (transform, position, older_waits) = decode().map_err(|e| self.catalog.failed(e))?;

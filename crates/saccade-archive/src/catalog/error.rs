@@ -1,76 +1,118 @@
-use std::path::{Path, PathBuf};
-
 use glam::{DVec3, UVec3};
 use saccade_core::volume::VolumeError;
+
+use super::CatalogLocation;
 
 /// Why the catalog could not do what was asked.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CatalogError {
-    /// There is no such file.
-    #[error("there is no catalog; `saccade ingest` makes one: {}", path.display())]
+    /// There is no such file, or the database is empty.
+    #[error("there is no catalog; `saccade ingest` makes one: {location}")]
     NotFound {
         /// Where it was looked for.
-        path: PathBuf,
+        location: CatalogLocation,
     },
-    /// The file is something else.
+    /// The file or the database is something else.
     #[error(
-        "this file is not a Saccade catalog and is left as it is; give another folder: {}",
-        path.display()
+        "this is not a Saccade catalog and is left as it is; give another folder or database: \
+         {location}"
     )]
     NotACatalog {
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
     },
     /// A newer Saccade wrote it.
     #[error(
         "the catalog was written by a newer Saccade (schema {found}, this one knows up to {known}); \
-         use that version: {}",
-        path.display()
+         use that version: {location}"
     )]
     NewerSchema {
         /// Schema of the file.
         found: i64,
         /// Newest schema of this program.
         known: i64,
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
     },
     /// An older Saccade wrote it, and it may only be read.
     #[error(
         "the catalog was written by an older Saccade (schema {found}, this one needs {known}) and may \
-         only be read here; open it once where it may be written: {}",
-        path.display()
+         only be read here; open it once where it may be written: {location}"
     )]
     OlderSchema {
         /// Schema of the file.
         found: i64,
         /// Schema of this program.
         known: i64,
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
     },
-    /// The file may only be read.
+    /// It may only be read.
     #[error(
-        "the catalog may only be read: check the permissions of its folder, or whether the file \
-         system is mounted read-only: {}",
-        path.display()
+        "the catalog may only be read: check the permissions of its folder or of the database's \
+         role, or whether the file system or the server is read-only: {location}"
     )]
     ReadOnly {
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
     },
     /// SQLite's write-ahead log needs memory that processes share, which network file systems lack.
     #[error(
         "the catalog cannot live on a network file system ({kind}), where SQLite may lose data; put \
-         the visualization archive on a local disk: {}",
-        path.display()
+         the visualization archive on a local disk, or the catalog into a PostgreSQL database: \
+         {location}"
     )]
     NetworkFilesystem {
         /// What the system calls it.
         kind: &'static str,
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// The address of the server means nothing.
+    #[error(
+        "this is no address of a PostgreSQL database; it looks like \
+         postgres://USER:PASSWORD@HOST:5432/DATABASE: {location}"
+    )]
+    Address {
+        /// What is wrong with it.
+        source: sqlx::Error,
+        /// As given.
+        location: CatalogLocation,
+    },
+    /// The server does not answer, or not yet.
+    #[error("the catalog's server does not answer; start it, or look at the network: {location}")]
+    Unreachable {
+        /// What happened.
+        source: sqlx::Error,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// The server may lose what it has acknowledged.
+    #[error(
+        "the catalog's server runs with {setting}=off and may lose acknowledged tiles at a power cut; \
+         set {setting} = on in its postgresql.conf and restart it: {location}"
+    )]
+    NotDurable {
+        /// The server's setting.
+        setting: &'static str,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// The changes asked for are no longer kept.
+    #[error(
+        "the changes after revision {after} of volume {name:?} are no longer kept, only those after \
+         {kept_after}: anything may have changed since"
+    )]
+    Missed {
+        /// The volume.
+        name: String,
+        /// As asked for.
+        after: u64,
+        /// All changes after this revision are kept.
+        kept_after: u64,
+        /// The volume's newest revision.
+        revision: u64,
     },
     /// There is no such volume.
     #[error("there is no volume {name:?}; the volumes are: {}", list(known))]
@@ -125,53 +167,108 @@ pub enum CatalogError {
         extent: UVec3,
     },
     /// No space left. The catalog is as it was before.
-    #[error("no space is left for the catalog; free some, then try again: {}", path.display())]
+    #[error("no space is left for the catalog; free some, then try again: {location}")]
     Full {
-        /// What SQLite says.
+        /// What the database says.
         source: sqlx::Error,
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
     },
     /// Anything else; see the source.
-    #[error("the catalog could not be read or written: {}", path.display())]
+    #[error("the catalog could not be read or written: {location}")]
     Database {
-        /// What SQLite says.
+        /// What the database says.
         source: sqlx::Error,
-        /// The file.
-        path: PathBuf,
+        /// Where it is.
+        location: CatalogLocation,
     },
 }
 
 impl CatalogError {
-    /// Sorts what SQLite says into the caller's cases.
-    pub(super) fn from_sqlite(source: sqlx::Error, path: &Path) -> Self {
-        let code = primary_code(&source);
-        let path = path.to_owned();
-        match code {
-            Some(13) => Self::Full { source, path },
-            Some(26) => Self::NotACatalog { path },
-            _ => Self::Database { source, path },
+    /// Sorts what the database says into the caller's cases.
+    pub(super) fn sort(source: sqlx::Error, location: &CatalogLocation) -> Self {
+        let case = match location {
+            CatalogLocation::File(_) => sqlite_case(&source),
+            CatalogLocation::Postgres(_) => postgres_case(&source),
+        };
+        let location = location.clone();
+        match case {
+            Case::Full => Self::Full { source, location },
+            Case::Foreign => Self::NotACatalog { location },
+            Case::ReadOnly => Self::ReadOnly { location },
+            Case::Unreachable => Self::Unreachable { source, location },
+            Case::Other => Self::Database { source, location },
         }
     }
 
-    /// Whether the same request may succeed later: space may be freed, another writer may finish.
+    /// Whether the same request may succeed later: space may be freed, another writer may finish, the
+    /// server may come back.
     pub fn is_transient(&self) -> bool {
         match self {
-            Self::Full { .. } => true,
+            Self::Full { .. } | Self::Unreachable { .. } => true,
             // SQLITE_IOERR.
-            Self::Database { source, .. } => {
-                self.is_busy()
-                    || primary_code(source) == Some(10)
-                    || matches!(source, sqlx::Error::PoolTimedOut)
-            }
+            Self::Database { source, location } => match location {
+                CatalogLocation::File(_) => {
+                    self.is_busy()
+                        || primary_code(source) == Some(10)
+                        || matches!(source, sqlx::Error::PoolTimedOut)
+                }
+                // Serialization failures, deadlocks, locks, lack of resources, system errors.
+                CatalogLocation::Postgres(_) => sql_state(source)
+                    .is_some_and(|s| ["40", "53", "55", "58"].iter().any(|c| s.starts_with(c))),
+            },
             _ => false,
         }
+    }
+
+    /// Whether it passes only when somebody does something, however long that takes: frees space, or
+    /// starts the server.
+    pub fn is_outage(&self) -> bool {
+        matches!(self, Self::Full { .. } | Self::Unreachable { .. })
     }
 
     /// Whether another connection was in the way.
     pub(super) fn is_busy(&self) -> bool {
         // SQLITE_BUSY, SQLITE_LOCKED.
-        matches!(self, Self::Database { source, .. } if matches!(primary_code(source), Some(5 | 6)))
+        matches!(self, Self::Database { source, location: CatalogLocation::File(_) }
+            if matches!(primary_code(source), Some(5 | 6)))
+    }
+}
+
+enum Case {
+    Full,
+    Foreign,
+    ReadOnly,
+    Unreachable,
+    Other,
+}
+
+fn sqlite_case(error: &sqlx::Error) -> Case {
+    match primary_code(error) {
+        Some(13) => Case::Full,
+        Some(26) => Case::Foreign,
+        _ => Case::Other,
+    }
+}
+
+fn postgres_case(error: &sqlx::Error) -> Case {
+    match error {
+        sqlx::Error::Io(_)
+        | sqlx::Error::PoolTimedOut
+        | sqlx::Error::WorkerCrashed
+        // A connection that was cut in the middle of a message.
+        | sqlx::Error::Protocol(_) => Case::Unreachable,
+        _ => match sql_state(error).as_deref() {
+            Some("53100") => Case::Full,
+            // A standby, or a role without the right.
+            Some("25006" | "42501") => Case::ReadOnly,
+            // Shutting down, crashed, starting, full of connections; and connections that broke.
+            Some(state) if state.starts_with("57P0") || state.starts_with("08") => {
+                Case::Unreachable
+            }
+            Some("53300") => Case::Unreachable,
+            _ => Case::Other,
+        },
     }
 }
 
@@ -179,6 +276,11 @@ impl CatalogError {
 fn primary_code(error: &sqlx::Error) -> Option<u32> {
     let code = error.as_database_error()?.code()?.parse::<u32>().ok()?;
     Some(code & 0xff)
+}
+
+/// PostgreSQL's five characters.
+fn sql_state(error: &sqlx::Error) -> Option<String> {
+    Some(error.as_database_error()?.code()?.into_owned())
 }
 
 fn list(names: &[String]) -> String {

@@ -1,22 +1,30 @@
-//! Tells subscribers of new revisions, from this process at once and from others by polling.
+//! Tells subscribers of new revisions, from this process at once and from others as soon as they are
+//! heard of: a file is looked at, a server tells.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
-use sqlx::{ConnectOptions, SqliteConnection};
+use sqlx::{ConnectOptions, PgPool, SqliteConnection};
 use tokio::sync::watch;
 
-use super::{Inner, open, rows};
+use super::database::Database;
+use super::{Inner, postgres, rows, sqlite};
 
 /// How often to look for commits of other processes. Reading the counter costs some microseconds.
 const POLL: Duration = Duration::from_millis(150);
 
+/// Pause before a server that did not answer is asked again.
+const TRY_AGAIN: Duration = Duration::from_millis(300);
+
+/// A listener that hears nothing for so long asks: a connection can die without a word.
+const SILENCE: Duration = Duration::from_secs(5);
+
 #[derive(Debug, Default)]
 pub(super) struct Watcher {
     senders: Mutex<BTreeMap<String, watch::Sender<u64>>>,
-    polling: AtomicBool,
+    following: AtomicBool,
 }
 
 impl Watcher {
@@ -26,8 +34,8 @@ impl Watcher {
             .entry(volume.to_owned())
             .or_default()
             .subscribe();
-        if !self.polling.swap(true, Ordering::AcqRel) {
-            tokio::spawn(poll(Polling(Arc::downgrade(catalog))));
+        if !self.following.swap(true, Ordering::AcqRel) {
+            tokio::spawn(follow(Following(Arc::downgrade(catalog))));
         }
         receiver
     }
@@ -50,26 +58,114 @@ impl Watcher {
 
 /// The task's hold on the catalog, which does not keep it open. A task that ends with its runtime
 /// makes room for the next one.
-struct Polling(Weak<Inner>);
+struct Following(Weak<Inner>);
 
-impl Drop for Polling {
+impl Following {
+    /// The catalog, while somebody has it open.
+    fn catalog(&self) -> Option<Arc<Inner>> {
+        self.0.upgrade().filter(|c| !c.database.is_closed())
+    }
+}
+
+impl Drop for Following {
     fn drop(&mut self) {
         if let Some(catalog) = self.0.upgrade() {
-            catalog.watcher.polling.store(false, Ordering::Release);
+            catalog.watcher.following.store(false, Ordering::Release);
         }
     }
 }
 
-async fn poll(polling: Polling) {
+async fn follow(following: Following) {
+    let pool = match following.catalog() {
+        Some(catalog) => match &catalog.database {
+            Database::Sqlite(_) => None,
+            Database::Postgres(pool) => Some(pool.clone()),
+        },
+        None => return,
+    };
+    match pool {
+        Some(pool) => listen(&following, &pool).await,
+        None => poll(&following).await,
+    }
+}
+
+/// Tells of all volumes, whatever was missed.
+async fn announce_all(catalog: &Inner) -> Result<(), sqlx::Error> {
+    let volumes = "SELECT name, revision FROM volumes";
+    for row in catalog.database.all(volumes, &[]).await? {
+        let name: String = row.get("name")?;
+        catalog
+            .watcher
+            .announce(&name, rows::unsigned(&row, "revision")?);
+    }
+    Ok(())
+}
+
+async fn listen(following: &Following, pool: &PgPool) {
+    let mut lost = false;
+    while let Some(catalog) = following.catalog() {
+        let location = catalog.location.to_string();
+        drop(catalog);
+        match hear(following, pool, &mut lost).await {
+            Ok(()) => return,
+            Err(e) => {
+                if !std::mem::replace(&mut lost, true) {
+                    log::warn!("changes are not heard, trying again: {e}: {location}");
+                }
+                tokio::time::sleep(TRY_AGAIN).await;
+            }
+        }
+    }
+}
+
+/// Hears until the catalog is closed.
+async fn hear(following: &Following, pool: &PgPool, lost: &mut bool) -> Result<(), sqlx::Error> {
+    let mut listener = postgres::listen(pool).await?;
+    let mut ask = true;
+    loop {
+        if ask {
+            let Some(catalog) = following.catalog() else {
+                return Ok(());
+            };
+            announce_all(&catalog).await?;
+            if std::mem::take(lost) {
+                log::warn!("changes are heard again: {}", catalog.location);
+            }
+        }
+        // A catalog that nobody has open any more is noticed as well.
+        let heard = tokio::time::timeout(SILENCE, listener.try_recv()).await;
+        ask = heard.is_err();
+        match heard {
+            Err(_) => {}
+            Ok(Ok(Some(told))) => {
+                let Some(catalog) = following.catalog() else {
+                    return Ok(());
+                };
+                if let Some((revision, volume)) = told.payload().split_once(' ')
+                    && let Ok(revision) = revision.parse()
+                {
+                    catalog.watcher.announce(volume, revision);
+                }
+            }
+            Ok(Ok(None)) => return Err(sqlx::Error::Protocol("the connection was lost".into())),
+            Ok(Err(e)) => return Err(e),
+        }
+    }
+}
+
+async fn poll(following: &Following) {
     let mut connection = None;
     let mut seen = None;
     let mut warned = false;
-    while let Some(catalog) = polling.0.upgrade().filter(|c| !c.readers.is_closed()) {
-        warn_of_writers(&catalog, &mut warned);
-        match look(&catalog, &mut connection, &mut seen).await {
+    while let Some(catalog) = following.catalog() {
+        let Database::Sqlite(file) = &catalog.database else {
+            return;
+        };
+        warn_of_writers(file, &mut warned);
+        match look(&catalog, file, &mut connection, &mut seen).await {
             Ok(()) => {}
             Err(e) => {
-                log::warn!("cannot look for changes: {e}: {}", catalog.path.display());
+                log::warn!("cannot look for changes: {e}: {}", catalog.location);
                 connection = None;
             }
         }
@@ -79,17 +175,18 @@ async fn poll(polling: Polling) {
 }
 
 /// Says once that a file which nobody was writing when it was opened is being written now.
-fn warn_of_writers(catalog: &Inner, warned: &mut bool) {
-    let unchanging = catalog.access == open::Access::ReadUnchanging;
-    if unchanging && !*warned && open::log_of(&catalog.path).exists() {
+fn warn_of_writers(file: &sqlite::Opened, warned: &mut bool) {
+    let unchanging = file.access == sqlite::Access::ReadUnchanging;
+    if unchanging && !*warned && sqlite::log_of(&file.path).exists() {
         *warned = true;
-        let path = catalog.path.display();
+        let path = file.path.display();
         log::warn!("the catalog is being written again; open it anew to see what is new: {path}");
     }
 }
 
 async fn look(
     catalog: &Inner,
+    file: &sqlite::Opened,
     connection: &mut Option<SqliteConnection>,
     seen: &mut Option<i64>,
 ) -> Result<(), sqlx::Error> {
@@ -98,11 +195,7 @@ async fn look(
         None => {
             // The counter only has meaning within one connection.
             *seen = None;
-            connection.insert(
-                open::options(&catalog.path, catalog.access)
-                    .connect()
-                    .await?,
-            )
+            connection.insert(sqlite::options(&file.path, file.access).connect().await?)
         }
     };
     let version: i64 = sqlx::query_scalar("PRAGMA data_version")
@@ -111,14 +204,5 @@ async fn look(
     if seen.replace(version) == Some(version) {
         return Ok(());
     }
-    let volumes = sqlx::query("SELECT name, revision FROM volumes")
-        .fetch_all(connection)
-        .await?;
-    for row in volumes {
-        let name: &str = sqlx::Row::try_get(&row, "name")?;
-        catalog
-            .watcher
-            .announce(name, rows::unsigned(&row, "revision")?);
-    }
-    Ok(())
+    announce_all(catalog).await
 }

@@ -14,7 +14,7 @@ use saccade_archive::acquisition::{
     AcquisitionError, AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
 };
 use saccade_archive::catalog::{
-    CatalogError, DeleteOutcome, Quarantined, TileOutcome, TransformOutcome,
+    CatalogError, CatalogLocation, DeleteOutcome, Quarantined, TileOutcome, TransformOutcome,
 };
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
@@ -121,17 +121,17 @@ pub async fn run(
 }
 
 /// One ingest at a time per volume. The system lets go of the lock when the process ends.
-fn lock(archive: &VisualizationArchive, volume: &str) -> Result<File, IngestError> {
-    let path = archive
-        .catalog()
-        .path()
-        .with_file_name(format!("ingest-{volume}.lock"));
+fn lock(archive: &VisualizationArchive, volume: &str) -> Result<Option<File>, IngestError> {
+    let CatalogLocation::File(catalog) = archive.catalog().location() else {
+        return Ok(None);
+    };
+    let path = catalog.with_file_name(format!("ingest-{volume}.lock"));
     let file = match File::create(&path) {
         Ok(file) => file,
         Err(source) => return Err(IngestError::Lock { source, path }),
     };
     match file.try_lock() {
-        Ok(()) => Ok(file),
+        Ok(()) => Ok(Some(file)),
         Err(std::fs::TryLockError::WouldBlock) => Err(IngestError::AlreadyRunning {
             volume: volume.to_owned(),
             path,
@@ -139,7 +139,7 @@ fn lock(archive: &VisualizationArchive, volume: &str) -> Result<File, IngestErro
         // Where there are no locks, the user keeps the order.
         Err(std::fs::TryLockError::Error(e)) => {
             log::warn!("cannot lock {}: {e}", path.display());
-            Ok(file)
+            Ok(Some(file))
         }
     }
 }
@@ -328,8 +328,7 @@ where
         match transaction().await {
             Ok(value) => return Ok(value),
             Err(e) => {
-                let full = matches!(e, CatalogError::Full { .. });
-                if !backoff.may_go_on(full, e.is_transient()) {
+                if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
                     return Err(e);
                 }
                 backoff.say_and_wait(progress, &e).await;

@@ -4,7 +4,6 @@ use std::sync::Weak;
 use std::time::Duration;
 
 use saccade_archive::catalog::{Catalog, CatalogError, ChangeReason};
-#[cfg(test)]
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::watch;
 
@@ -46,7 +45,18 @@ async fn catch_up(
     seen: &mut u64,
 ) -> Result<(), CatalogError> {
     while let Some(name) = inner.upgrade().map(|inner| inner.volume.name.clone()) {
-        let changes = catalog.changes_after(&name, *seen).await?;
+        let changes = match catalog.changes_after(&name, *seen).await {
+            Err(CatalogError::Missed { revision, .. }) => {
+                let Some(inner) = inner.upgrade() else {
+                    return Ok(());
+                };
+                inner.builder.tiles().index().reload().await?;
+                inner.tell_missed(revision);
+                *seen = revision;
+                continue;
+            }
+            changes => changes?,
+        };
         let Some(inner) = inner.upgrade().filter(|_| !changes.is_empty()) else {
             return Ok(());
         };
@@ -68,6 +78,19 @@ async fn catch_up(
         }
     }
     Ok(())
+}
+
+impl Inner {
+    /// Away for longer than changes are kept: anything may be another.
+    fn tell_missed(&self, revision: u64) {
+        let voxels = VoxelBox::of_size(self.volume.extent());
+        self.forget(voxels);
+        self.changes.send(Change {
+            revision,
+            voxels,
+            reason: crate::ChangeReason::Missed,
+        });
+    }
 }
 
 fn reason(reason: ChangeReason) -> crate::ChangeReason {

@@ -207,6 +207,19 @@ impl TileIndex {
         turned
     }
 
+    /// Forgets all it knows, where it cannot be told what changed.
+    ///
+    /// # Errors
+    ///
+    /// What the database says; it knows then what it knew before.
+    pub async fn reload(&self) -> Result<(), CatalogError> {
+        // Whoever begins to load a section after these were read sees what is in the catalog now.
+        let acquired = self.catalog.sections(&self.volume).await?;
+        *lock(&self.acquired) = acquired.into_iter().collect();
+        lock(&self.sections).clear();
+        Ok(())
+    }
+
     /// Tiles of the sections that are loaded.
     pub fn tiles(&self) -> u64 {
         let sections = lock(&self.sections);

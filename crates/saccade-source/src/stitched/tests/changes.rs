@@ -12,6 +12,7 @@ use futures::future::{BoxFuture, Either, FutureExt, select};
 use glam::{DVec3, UVec3};
 use proptest::prelude::*;
 use saccade_archive::storage::{Entry, MemoryStorage, Storage, StorageError};
+use saccade_core::transform::SectionFromTile;
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::watch;
 
@@ -204,6 +205,36 @@ proptest! {
             Ok(())
         })?;
     }
+}
+
+#[test]
+fn changes_that_are_no_longer_kept_leave_nothing_stale() {
+    run(async {
+        let mut fixture = small(Arc::new(MemoryStorage::new())).await;
+        let tile = |n: u64| tile((80, 130), 1, (4.0, 5.0), 0.0, 1.0, n);
+        fixture.put("t0", tile(0)).await;
+        let source = fixture.open().await;
+        let mut changes = source.changes();
+        read_all(&source).await;
+        let catalog = fixture.archive.catalog().clone().with_changes_kept(2);
+        let mut commit = catalog.begin("v").await.unwrap();
+        for n in 0..20 {
+            let to = SectionFromTile::translation(glam::DVec2::splat(f64::from(n)));
+            commit.transform("t0", to, None).await.unwrap();
+        }
+        let newest = commit.finish().await.unwrap();
+        let missed = changes.next().await.unwrap();
+        let all = VoxelBox::of_size(fixture.volume.extent());
+        let want = (newest, all, crate::ChangeReason::Missed);
+        assert_eq!((missed.revision, missed.voxels, missed.reason), want);
+        let fresh = fixture.open().await;
+        assert!(read_all(&source).await == read_all(&fresh).await);
+        // And it goes on from there.
+        fixture.put("t1", tile(1)).await;
+        caught_up(&fixture, &mut changes).await;
+        let fresh = fixture.open().await;
+        assert!(read_all(&source).await == read_all(&fresh).await);
+    });
 }
 
 /// Holds reads back until it is opened.

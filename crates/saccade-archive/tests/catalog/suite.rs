@@ -1,10 +1,6 @@
-//! What the catalog promises: order, revisions, boxes, all or nothing, several processes.
-
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on fails")]
-#![expect(clippy::cast_possible_truncation, reason = "small whole numbers")]
+//! Order, revisions, boxes, all or nothing, several processes.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use glam::{DVec2, DVec3, UVec2, UVec3};
@@ -12,24 +8,26 @@ use proptest::prelude::*;
 use saccade_archive::acquisition::{Cursor, TileRecord};
 use saccade_archive::catalog::{
     CHANGES_AT_ONCE, Catalog, CatalogChange, CatalogError, ChangeReason, Commit, DeleteOutcome,
-    NewTile, Quarantined, Statistics, TileId, TileOutcome, TransformOutcome, Waiting, place,
+    NewTile, Quarantined, Statistics, TileId, TileOutcome, TransformOutcome, Waiting,
+    place as cover,
 };
-use saccade_archive::{ArchiveError, VisualizationArchive};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Volume;
 
-const EXTENT: UVec3 = UVec3::new(100, 80, 6);
-const SIZE: UVec2 = UVec2::new(20, 10);
+use crate::place::Place;
 
-fn volume(name: &str) -> Volume {
+pub(crate) const EXTENT: UVec3 = UVec3::new(100, 80, 6);
+pub(crate) const SIZE: UVec2 = UVec2::new(20, 10);
+
+pub(crate) fn volume(name: &str) -> Volume {
     Volume::new(name, EXTENT, DVec3::new(4.0, 4.0, 40.0)).unwrap()
 }
 
-fn at(x: f64, y: f64) -> SectionFromTile {
+pub(crate) fn at(x: f64, y: f64) -> SectionFromTile {
     SectionFromTile::translation(DVec2::new(x, y))
 }
 
-fn tile(name: &str, section: u32, transform: SectionFromTile, position: u64) -> NewTile {
+pub(crate) fn tile(name: &str, section: u32, transform: SectionFromTile, position: u64) -> NewTile {
     NewTile {
         name: name.to_owned(),
         section,
@@ -41,15 +39,7 @@ fn tile(name: &str, section: u32, transform: SectionFromTile, position: u64) -> 
     }
 }
 
-async fn catalog(folder: &Path) -> Catalog {
-    let catalog = Catalog::create(&folder.join("catalog.sqlite"))
-        .await
-        .unwrap();
-    catalog.create_volume(&volume("v")).await.unwrap();
-    catalog
-}
-
-async fn all_changes(catalog: &Catalog) -> Vec<CatalogChange> {
+pub(crate) async fn all_changes(catalog: &Catalog) -> Vec<CatalogChange> {
     let mut all = Vec::new();
     loop {
         let after = all.last().map_or(0, |c: &CatalogChange| c.revision);
@@ -62,10 +52,10 @@ async fn all_changes(catalog: &Catalog) -> Vec<CatalogChange> {
 }
 
 /// Section, transform and pyramid of each tile, by name.
-type Tiles = BTreeMap<String, (u32, [f64; 6], String)>;
+pub(crate) type Tiles = BTreeMap<String, (u32, [f64; 6], String)>;
 
 /// Everything a reader sees of the tiles, without what depends on the way they came.
-async fn tiles(catalog: &Catalog) -> Tiles {
+pub(crate) async fn tiles(catalog: &Catalog) -> Tiles {
     let mut all = Tiles::new();
     for z in catalog.sections("v").await.unwrap() {
         for t in catalog.section_tiles("v", z).await.unwrap() {
@@ -76,10 +66,8 @@ async fn tiles(catalog: &Catalog) -> Tiles {
     all
 }
 
-#[tokio::test]
-async fn a_tile_is_what_was_entered() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn a_tile_is_what_was_entered(place: &Place) {
+    let catalog = place.catalog().await;
     let turned = SectionFromTile::rotated(SIZE.as_dvec2(), 0.1, DVec2::new(3.0, 4.5));
     assert_eq!(
         catalog
@@ -107,22 +95,20 @@ async fn a_tile_is_what_was_entered() {
     assert_eq!(catalog.volume("v").await.unwrap(), volume("v"));
     let changes = all_changes(&catalog).await;
     assert_eq!(changes.len(), 1);
-    assert_eq!(changes[0].voxels, place(EXTENT, 2, SIZE, turned).unwrap());
+    assert_eq!(changes[0].voxels, cover(EXTENT, 2, SIZE, turned).unwrap());
     assert_eq!(
         (changes[0].reason, changes[0].tile),
         (ChangeReason::Tile, seen[0].id)
     );
 }
 
-#[tokio::test]
-async fn a_moved_tile_changes_its_old_and_its_new_place() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn a_moved_tile_changes_its_old_and_its_new_place(place: &Place) {
+    let catalog = place.catalog().await;
     catalog
         .commit_tile("v", &tile("a", 2, at(0.0, 0.0), 0))
         .await
         .unwrap();
-    let box_at = |z, x, y| place(EXTENT, z, SIZE, at(x, y)).unwrap();
+    let box_at = |z, x, y| cover(EXTENT, z, SIZE, at(x, y)).unwrap();
 
     // A little: one change around both. Far: one each, and nothing in between.
     catalog.set_transform("v", "a", at(5.0, 0.0)).await.unwrap();
@@ -161,10 +147,8 @@ async fn a_moved_tile_changes_its_old_and_its_new_place() {
     assert_eq!(catalog.revision("v").await.unwrap(), 6);
 }
 
-#[tokio::test]
-async fn nothing_leaves_the_volume() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn nothing_leaves_the_volume(place: &Place) {
+    let catalog = place.catalog().await;
     for outside in [
         tile("a", 6, at(0.0, 0.0), 0),
         tile("a", 0, at(100.0, 0.0), 0),
@@ -188,10 +172,8 @@ async fn nothing_leaves_the_volume() {
     assert_eq!((stayed.transform, stayed.revision), (at(99.0, 79.0), 1));
 }
 
-#[tokio::test]
-async fn an_early_transform_waits_for_its_tile() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn an_early_transform_waits_for_its_tile(place: &Place) {
+    let catalog = place.catalog().await;
     let kept = catalog.set_transform("v", "a", at(7.0, 7.0)).await.unwrap();
     assert_eq!(kept, TransformOutcome::Kept);
     assert_eq!(catalog.revision("v").await.unwrap(), 0);
@@ -214,10 +196,8 @@ async fn an_early_transform_waits_for_its_tile() {
     );
 }
 
-#[tokio::test]
-async fn a_deleted_tile_is_gone_until_a_later_record_brings_it_back() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn a_deleted_tile_is_gone_until_a_later_record_brings_it_back(place: &Place) {
+    let catalog = place.catalog().await;
     let begin = SystemTime::now() - Duration::from_secs(1);
     let a = tile("a", 2, at(5.0, 6.0), 10);
     catalog.commit_tile("v", &a).await.unwrap();
@@ -251,7 +231,7 @@ async fn a_deleted_tile_is_gone_until_a_later_record_brings_it_back() {
     let last = changes.last().unwrap();
     let want = (3, id, 2, ChangeReason::Deleted);
     assert_eq!((last.revision, last.tile, last.section, last.reason), want);
-    assert_eq!(last.voxels, place(EXTENT, 2, SIZE, at(5.0, 6.0)).unwrap());
+    assert_eq!(last.voxels, cover(EXTENT, 2, SIZE, at(5.0, 6.0)).unwrap());
 
     // What was said before stays without effect, whenever it comes.
     let late = catalog
@@ -299,10 +279,8 @@ fn broken(tile: &str) -> Quarantined {
     }
 }
 
-#[tokio::test]
-async fn channels_stay_apart() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn channels_stay_apart(place: &Place) {
+    let catalog = place.catalog().await;
     for channel in [0, 3] {
         let tile = NewTile {
             channel,
@@ -315,50 +293,8 @@ async fn channels_stay_apart() {
     assert_eq!(channels, [("c0", 0), ("c3", 3)]);
 }
 
-#[tokio::test]
-async fn a_catalog_of_the_first_schema_is_brought_up() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("catalog.sqlite");
-    let first = include_str!("../migrations/sqlite/0001_first.sql");
-    sql(&path, first).await;
-    let description = serde_json::to_string(&volume("v")).unwrap();
-    sql(&path, &format!(
-        "INSERT INTO volumes VALUES (1, 'v', '{description}', 3, 3);
-         INSERT INTO tiles VALUES (1, 1, 'a', 2, 20, 10, 1, 0, 0, 1, 5, 6, 'tiles/a', 1, 0, 0),
-             (2, 1, 'b', 2, 20, 10, 1, 0, 0, 1, 0, 0, 'tiles/b', 2, 1, 1),
-             (3, 1, 'c', 4, 20, 10, 1, 0, 0, 1, 0, 0, 'tiles/c', 3, 2, 2);
-         INSERT INTO changes VALUES (1, 1, 1, 2, 5, 6, 25, 16, 'tile'),
-             (1, 2, 2, 2, 0, 0, 20, 10, 'tile'), (1, 3, 3, 4, 0, 0, 20, 10, 'transform');
-         CREATE TABLE _sqlx_migrations (version BIGINT PRIMARY KEY, description TEXT NOT NULL,
-             installed_on TIMESTAMP NOT NULL DEFAULT CURRENT_TIMESTAMP, success BOOLEAN NOT NULL,
-             checksum BLOB NOT NULL, execution_time BIGINT NOT NULL);
-         INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-             VALUES (1, 'first', true, x'{}', 1);",
-        // What the first version of the program noted of its file.
-        "25fd3d881f73b2437659234f8695fad1af353f2f9c6624435927b0b778da3c13e9c860a3023ac509ba99afd56c9cf64b"
-    )).await;
-    let catalog = Catalog::open(&path).await.unwrap();
-    assert_eq!(catalog.sections("v").await.unwrap(), [2, 4]);
-    let tiles = catalog.section_tiles("v", 2).await.unwrap();
-    let names: Vec<_> = tiles.iter().map(|t| (&*t.name, t.channel)).collect();
-    assert_eq!(names, [("a", 0), ("b", 0)]);
-    let reasons: Vec<_> = all_changes(&catalog)
-        .await
-        .iter()
-        .map(|c| c.reason)
-        .collect();
-    let (tile, transform) = (ChangeReason::Tile, ChangeReason::Transform);
-    assert_eq!(reasons, [tile, tile, transform]);
-    let deleted = catalog.delete_tile("v", "c", 9).await.unwrap();
-    assert_eq!(deleted, DeleteOutcome::Deleted);
-    assert_eq!(catalog.sections("v").await.unwrap(), [2]);
-    assert_eq!(catalog.statistics("v").await.unwrap().tiles, 2);
-}
-
-#[tokio::test]
-async fn a_replaced_pyramid_is_retired_not_forgotten() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn a_replaced_pyramid_is_retired_not_forgotten(place: &Place) {
+    let catalog = place.catalog().await;
     let begin = SystemTime::now() - Duration::from_secs(1);
     let later = SystemTime::now() + Duration::from_secs(600);
     catalog
@@ -391,10 +327,8 @@ async fn a_replaced_pyramid_is_retired_not_forgotten() {
     assert_eq!(catalog.retired("v", later, 9).await.unwrap(), []);
 }
 
-#[tokio::test]
-async fn a_commit_happens_whole_or_not_at_all() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
+    let catalog = place.catalog().await;
     let waiting = waiting("w", 1, at(0.0, 0.0), 5);
     let broken = broken("b");
     let cursor = Cursor {
@@ -424,13 +358,14 @@ async fn a_commit_happens_whole_or_not_at_all() {
     catalog.close().await;
 
     // Another process, later.
-    let catalog = Catalog::open(catalog.path()).await.unwrap();
+    let catalog = Catalog::open(catalog.location()).await.unwrap();
     let want = Statistics {
         revision: 1,
         tiles: 1,
         sections: 1,
         quarantined: 1,
         waiting: 1,
+        queued: 0,
         early: 1,
     };
     assert_eq!(catalog.statistics("v").await.unwrap(), want);
@@ -451,7 +386,12 @@ async fn a_commit_happens_whole_or_not_at_all() {
     assert_eq!(catalog.quarantined("v").await.unwrap(), []);
 }
 
-fn waiting(tile: &str, section: u32, transform: SectionFromTile, position: u64) -> Waiting {
+pub(crate) fn waiting(
+    tile: &str,
+    section: u32,
+    transform: SectionFromTile,
+    position: u64,
+) -> Waiting {
     let (tile, file) = (tile.to_owned(), format!("{tile}.tif"));
     let record = TileRecord {
         tile,
@@ -468,10 +408,8 @@ fn waiting(tile: &str, section: u32, transform: SectionFromTile, position: u64) 
     }
 }
 
-#[tokio::test]
-async fn tiles_are_found_by_id() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn tiles_are_found_by_id(place: &Place) {
+    let catalog = place.catalog().await;
     for (n, name) in (0..).zip(["a", "b", "c", "d"]) {
         let tile = tile(name, 2, at(0.0, 0.0), n);
         catalog.commit_tile("v", &tile).await.unwrap();
@@ -490,10 +428,8 @@ async fn tiles_are_found_by_id() {
     assert!(catalog.tiles("w", &ids).await.is_err());
 }
 
-#[tokio::test]
-async fn sections_are_those_with_tiles() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn sections_are_those_with_tiles(place: &Place) {
+    let catalog = place.catalog().await;
     assert!(catalog.sections("v").await.unwrap().is_empty());
     let mut commit = catalog.begin("v").await.unwrap();
     for (n, z) in (0..).zip([5, 0, 3, 3, 0, 5, 5]) {
@@ -505,10 +441,8 @@ async fn sections_are_those_with_tiles() {
     assert_eq!(catalog.section_tiles("v", 5).await.unwrap().len(), 3);
 }
 
-#[tokio::test]
-async fn long_histories_come_in_pieces_without_gaps() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn long_histories_come_in_pieces_without_gaps(place: &Place) {
+    let catalog = place.catalog().await;
     let mut commit = catalog.begin("v").await.unwrap();
     commit
         .tile(&tile("a", 0, at(0.0, 0.0), 0), SystemTime::now())
@@ -534,13 +468,11 @@ async fn long_histories_come_in_pieces_without_gaps() {
     assert_eq!(revisions, (1..=moves + 1).collect::<Vec<_>>());
 }
 
-#[tokio::test]
-async fn other_processes_commits_are_heard() {
-    let folder = tempfile::tempdir().unwrap();
-    let here = catalog(folder.path()).await;
+pub(crate) async fn other_processes_commits_are_heard(place: &Place) {
+    let here = place.catalog().await;
     here.create_volume(&volume("other")).await.unwrap();
     // A second handle shares nothing with the first but the file, like another process.
-    let there = Catalog::open(here.path()).await.unwrap();
+    let there = Catalog::open(here.location()).await.unwrap();
     let mut heard = here.subscribe("v").await.unwrap();
     let mut own = there.subscribe("v").await.unwrap();
     let mut other = here.subscribe("other").await.unwrap();
@@ -578,12 +510,10 @@ async fn other_processes_commits_are_heard() {
     assert!(matches!(unknown, Err(CatalogError::UnknownVolume { .. })));
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn several_writers_take_turns() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("catalog.sqlite");
+pub(crate) async fn several_writers_take_turns(place: &Place) {
     // Both make it at once.
-    let (a, b) = tokio::join!(Catalog::create(&path), Catalog::create(&path));
+    let create = || Catalog::create(place.location());
+    let (a, b) = tokio::join!(create(), create());
     let (a, b) = (a.unwrap(), b.unwrap());
     let v = volume("v");
     let (one, two) = tokio::join!(a.create_volume(&v), b.create_volume(&v));
@@ -603,10 +533,8 @@ async fn several_writers_take_turns() {
     assert_eq!(revisions, (1..=24).collect::<Vec<_>>());
 }
 
-#[tokio::test]
-async fn other_sizes_and_unknown_names_are_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(folder.path()).await;
+pub(crate) async fn other_sizes_and_unknown_names_are_refused(place: &Place) {
+    let catalog = place.catalog().await;
     catalog.create_volume(&volume("v")).await.unwrap();
     let nm = DVec3::new(4.0, 4.0, 40.0);
     let larger = Volume::new("v", EXTENT + 1, nm).unwrap();
@@ -641,71 +569,9 @@ async fn other_sizes_and_unknown_names_are_refused() {
     assert_eq!(names, ["v"]);
 }
 
-#[tokio::test]
-async fn what_is_no_archive_is_left_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("catalog.sqlite");
-    let none = VisualizationArchive::open(folder.path()).await;
-    assert!(matches!(none, Err(ArchiveError::NotAnArchive { .. })));
-    assert!(matches!(
-        Catalog::open(&path).await,
-        Err(CatalogError::NotFound { .. })
-    ));
-    assert!(!path.exists());
-
-    std::fs::write(&path, "dear diary").unwrap();
-    let text = VisualizationArchive::open(folder.path()).await;
-    assert!(matches!(
-        text,
-        Err(ArchiveError::Catalog(CatalogError::NotACatalog { .. }))
-    ));
-    assert_eq!(std::fs::read_to_string(&path).unwrap(), "dear diary");
-
-    // Somebody else's database.
-    std::fs::remove_file(&path).unwrap();
-    sql(&path, "CREATE TABLE birds (name TEXT)").await;
-    assert!(matches!(
-        Catalog::open(&path).await,
-        Err(CatalogError::NotACatalog { .. })
-    ));
-}
-
-#[tokio::test]
-async fn a_newer_schema_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("catalog.sqlite");
-    Catalog::create(&path).await.unwrap().close().await;
-    Catalog::open(&path).await.unwrap().close().await;
-    let future = "INSERT INTO _sqlx_migrations \
-                  (version, description, success, checksum, execution_time) \
-                  VALUES (4711, 'from the future', true, x'00', 0)";
-    sql(&path, future).await;
-    let refused = Catalog::open(&path).await;
-    assert!(
-        matches!(refused, Err(CatalogError::NewerSchema { found: 4711, .. })),
-        "{refused:?}"
-    );
-}
-
-/// Does something to the file behind the catalog's back.
-async fn sql(path: &Path, statements: &str) {
-    use sqlx::Connection;
-    let options = sqlx::sqlite::SqliteConnectOptions::new()
-        .filename(path)
-        .create_if_missing(true);
-    let mut connection = sqlx::SqliteConnection::connect_with(&options)
-        .await
-        .unwrap();
-    sqlx::raw_sql(sqlx::AssertSqlSafe(statements))
-        .execute(&mut connection)
-        .await
-        .unwrap();
-    connection.close().await.unwrap();
-}
-
 /// One record of a stream; a tile's file is whole so many records later.
 #[derive(Clone, Debug)]
-enum Said {
+pub(crate) enum Said {
     Tile {
         name: usize,
         section: u32,
@@ -723,7 +589,7 @@ enum Said {
     },
 }
 
-fn said() -> impl Strategy<Value = Said> {
+pub(crate) fn said() -> impl Strategy<Value = Said> {
     let place = || (0..80i32, 0..70i32);
     prop_oneof![
         5 => (
@@ -745,7 +611,7 @@ fn said() -> impl Strategy<Value = Said> {
 }
 
 /// Commits one record; a tile that is late is returned instead, after it was told to wait.
-async fn commit_one(
+pub(crate) async fn commit_one(
     commit: &mut Commit<'_>,
     said: &Said,
     position: usize,
@@ -789,7 +655,7 @@ async fn commit_one(
 }
 
 /// Commits a stream, tiles as late as they say or all in time, in one transaction.
-async fn commit_stream(catalog: &Catalog, stream: &[Said], in_time: bool) -> u64 {
+pub(crate) async fn commit_stream(catalog: &Catalog, stream: &[Said], in_time: bool) -> u64 {
     let mut commit = catalog.begin("v").await.unwrap();
     let mut late = Vec::new();
     for (position, said) in stream.iter().enumerate() {
@@ -804,7 +670,7 @@ async fn commit_stream(catalog: &Catalog, stream: &[Said], in_time: bool) -> u64
 }
 
 /// What the documentation of the catalog says, in the plainest way.
-fn model(stream: &[Said]) -> Tiles {
+pub(crate) fn model(stream: &[Said]) -> Tiles {
     let mut tiles = Tiles::new();
     let mut early = BTreeMap::new();
     for (position, said) in stream.iter().enumerate() {
@@ -843,7 +709,7 @@ fn model(stream: &[Said]) -> Tiles {
 }
 
 /// Which image covers which voxel; coordinates are whole, so this needs no rounding.
-fn covered(tiles: &Tiles) -> BTreeSet<([u32; 3], String)> {
+pub(crate) fn covered(tiles: &Tiles) -> BTreeSet<([u32; 3], String)> {
     let mut voxels = BTreeSet::new();
     for (section, t, pyramid) in tiles.values() {
         for y in 0..SIZE.y {
@@ -856,61 +722,4 @@ fn covered(tiles: &Tiles) -> BTreeSet<([u32; 3], String)> {
         }
     }
     voxels
-}
-
-fn block_on<T>(work: impl Future<Output = T>) -> T {
-    tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .unwrap()
-        .block_on(work)
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig { cases: 48, failure_persistence: None, ..Default::default() })]
-
-    /// Whenever the files get whole, the volume ends up the same, as the records' order says.
-    #[test]
-    fn late_files_change_nothing(stream in proptest::collection::vec(said(), 1..14)) {
-        block_on(async {
-            for in_time in [true, false] {
-                let folder = tempfile::tempdir().unwrap();
-                let catalog = catalog(folder.path()).await;
-                let revision = commit_stream(&catalog, &stream, in_time).await;
-                let seen = tiles(&catalog).await;
-                prop_assert_eq!(&seen, &model(&stream), "in time: {}", in_time);
-                prop_assert_eq!(catalog.entry("v").await.unwrap().tiles, seen.len() as u64);
-                prop_assert_eq!(catalog.waiting("v").await.unwrap(), []);
-                let changes = all_changes(&catalog).await;
-                let revisions: Vec<_> = changes.iter().map(|c| c.revision).collect();
-                prop_assert_eq!(revisions, (1..=revision).collect::<Vec<_>>());
-            }
-            Ok(())
-        })?;
-    }
-
-    /// Whoever draws the boxes of the changes anew sees everything that happened.
-    #[test]
-    fn changes_cover_what_changed(stream in proptest::collection::vec(said(), 1..10)) {
-        block_on(async {
-            let folder = tempfile::tempdir().unwrap();
-            let catalog = catalog(folder.path()).await;
-            let mut before = BTreeSet::new();
-            let mut revision = 0;
-            for (position, said) in stream.iter().enumerate() {
-                let mut commit = catalog.begin("v").await.unwrap();
-                commit_one(&mut commit, said, position, true).await;
-                let next = commit.finish().await.unwrap();
-                let changes = catalog.changes_after("v", revision).await.unwrap();
-                let after = covered(&model(&stream[..=position]));
-                for (voxel, _) in before.symmetric_difference(&after) {
-                    let voxel = UVec3::from_array(*voxel);
-                    let told = changes.iter().any(|c| c.voxels.contains(voxel));
-                    prop_assert!(told, "{} changed unheard by {:?}", voxel, said);
-                }
-                (before, revision) = (after, next);
-            }
-            Ok(())
-        })?;
-    }
 }

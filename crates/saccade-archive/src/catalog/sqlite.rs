@@ -1,4 +1,4 @@
-//! Opening the file: what it may be, how it is used, which schema it has.
+//! A catalog in a file of SQLite's: what it may be, how it is used, which schema it has.
 
 use std::cmp::Ordering;
 use std::fs::File;
@@ -12,7 +12,7 @@ use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
 
-static MIGRATOR: Migrator = sqlx::migrate!("migrations/sqlite");
+pub(super) static MIGRATOR: Migrator = sqlx::migrate!("migrations/sqlite");
 
 /// "Sacc": marks the file as ours, whatever tables it has.
 const APPLICATION_ID: i64 = 0x5361_6363;
@@ -49,11 +49,23 @@ pub(super) fn options(path: &Path, access: Access) -> SqliteConnectOptions {
 }
 
 /// The connections to an open file.
+#[derive(Debug)]
 pub(super) struct Opened {
+    pub(super) path: PathBuf,
     pub(super) access: Access,
-    /// One connection; none if the file may only be read.
+    /// One connection, since SQLite lets one write at a time and waiting here costs no time-out;
+    /// none if the file may only be read.
     pub(super) writer: Option<SqlitePool>,
     pub(super) readers: SqlitePool,
+}
+
+impl Opened {
+    pub(super) async fn close(&self) {
+        self.readers.close().await;
+        if let Some(writer) = &self.writer {
+            writer.close().await;
+        }
+    }
 }
 
 /// Opens the file: for writing if that is allowed, and then makes it if it is missing; else for
@@ -83,6 +95,7 @@ async fn open_to_write(path: &Path) -> Result<Opened, CatalogError> {
     migrate(&writer, path).await?;
     let readers = open_readers(path, access).await?;
     Ok(Opened {
+        path: path.to_owned(),
         access,
         writer: Some(writer),
         readers,
@@ -100,6 +113,7 @@ pub(super) async fn open_to_read(path: &Path) -> Result<Opened, CatalogError> {
     let readers = open_readers(path, access).await?;
     refuse_other_schema(&readers, path).await?;
     Ok(Opened {
+        path: path.to_owned(),
         access,
         writer: None,
         readers,
@@ -125,7 +139,7 @@ async fn connect(
         match pool.clone().connect_with(options.clone()).await {
             Ok(pool) => return Ok(pool),
             Err(e) => {
-                let error = CatalogError::from_sqlite(e, path);
+                let error = CatalogError::sort(e, &path.into());
                 tries += 1;
                 if !error.is_busy() || tries == TRIES {
                     return Err(error);
@@ -157,7 +171,7 @@ fn refuse_foreign_file(path: &Path) -> Result<(), CatalogError> {
     let foreign = read.is_ok() && !head.is_empty() && head != b"SQLite format 3\0";
     if foreign {
         Err(CatalogError::NotACatalog {
-            path: path.to_owned(),
+            location: path.into(),
         })
     } else {
         Ok(())
@@ -189,7 +203,7 @@ fn refuse_network(path: &Path) -> Result<(), CatalogError> {
     match KINDS.iter().find(|(number, _)| *number == magic) {
         Some((_, kind)) => Err(CatalogError::NetworkFilesystem {
             kind,
-            path: path.to_owned(),
+            location: path.into(),
         }),
         None => Ok(()),
     }
@@ -201,7 +215,7 @@ fn refuse_network(_: &Path) -> Result<(), CatalogError> {
 }
 
 async fn migrate(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
-    let failed = |e| CatalogError::from_sqlite(e, path);
+    let failed = |e| CatalogError::sort(e, &path.into());
     let mut connection = pool.acquire().await.map_err(failed)?;
     // Two processes may make the same catalog at once: the one that loses looks again.
     let mut attempts = 0;
@@ -232,13 +246,13 @@ fn newer_schema(found: i64, path: &Path) -> CatalogError {
     CatalogError::NewerSchema {
         found,
         known: known_schema(),
-        path: path.to_owned(),
+        location: path.into(),
     }
 }
 
 /// A file that may only be read must have this program's schema already.
 async fn refuse_other_schema(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
-    let failed = |e| CatalogError::from_sqlite(e, path);
+    let failed = |e| CatalogError::sort(e, &path.into());
     let mut connection = pool.acquire().await.map_err(failed)?;
     refuse_foreign_database(&mut connection, path).await?;
     let query = sqlx::query_scalar("SELECT coalesce(max(version), 0) FROM _sqlx_migrations");
@@ -249,7 +263,7 @@ async fn refuse_other_schema(pool: &SqlitePool, path: &Path) -> Result<(), Catal
         Ordering::Less => Err(CatalogError::OlderSchema {
             found,
             known: known_schema(),
-            path: path.to_owned(),
+            location: path.into(),
         }),
     }
 }
@@ -264,11 +278,11 @@ async fn refuse_foreign_database(
     let (id, tables): (i64, i64) = sqlx::query_as(query)
         .fetch_one(connection)
         .await
-        .map_err(|e| CatalogError::from_sqlite(e, path))?;
+        .map_err(|e| CatalogError::sort(e, &path.into()))?;
     let foreign = tables > 0 && id != APPLICATION_ID;
     if foreign {
         Err(CatalogError::NotACatalog {
-            path: path.to_owned(),
+            location: path.into(),
         })
     } else {
         Ok(())
@@ -282,6 +296,7 @@ mod tests {
     use saccade_core::volume::Volume;
 
     use super::*;
+    use crate::catalog::database::Database;
     use crate::catalog::{Catalog, NewTile};
 
     #[tokio::test]
@@ -342,14 +357,22 @@ mod tests {
     }
 
     async fn to_read(path: &Path) -> Catalog {
-        Catalog::of(path, open_to_read(path).await.unwrap())
+        let opened = Database::Sqlite(open_to_read(path).await.unwrap());
+        Catalog::of(path.into(), opened)
+    }
+
+    fn access(catalog: &Catalog) -> Access {
+        match &catalog.inner.database {
+            Database::Sqlite(opened) => opened.access,
+            Database::Postgres(_) => panic!("a file"),
+        }
     }
 
     #[tokio::test]
     async fn who_may_only_read_follows_who_writes() {
         let (_folder, path, writing) = written().await;
         let reading = to_read(&path).await;
-        assert_eq!(reading.inner.access, Access::Read);
+        assert_eq!(access(&reading), Access::Read);
         let mut heard = reading.subscribe("v").await.unwrap();
         assert_eq!(*heard.borrow_and_update(), 1);
         writing.commit_tile("v", &tile("b")).await.unwrap();
@@ -368,7 +391,7 @@ mod tests {
         let (folder, path, writing) = written().await;
         writing.close().await;
         let reading = to_read(&path).await;
-        assert_eq!(reading.inner.access, Access::ReadUnchanging);
+        assert_eq!(access(&reading), Access::ReadUnchanging);
         assert_eq!(reading.entry("v").await.unwrap().tiles, 1);
         let files = std::fs::read_dir(folder.path()).unwrap().count();
         assert_eq!(files, 1, "neither log nor shared memory");
@@ -377,12 +400,18 @@ mod tests {
     #[tokio::test]
     async fn other_schemas_cannot_be_read() {
         let (_folder, path, writing) = written().await;
-        for (version, older) in [(known_schema() + 1, false), (0, true)] {
-            sqlx::query("UPDATE _sqlx_migrations SET version = ?")
-                .bind(version)
-                .execute(writing.writer().unwrap())
-                .await
-                .unwrap();
+        for (version, older) in [(known_schema() + 1, false), (known_schema() - 1, true)] {
+            let Database::Sqlite(Opened {
+                writer: Some(writer),
+                ..
+            }) = &writing.inner.database
+            else {
+                panic!("a file that may be written")
+            };
+            let query = "UPDATE _sqlx_migrations SET version = ? \
+                         WHERE version = (SELECT max(version) FROM _sqlx_migrations)";
+            let query = sqlx::query(query).bind(version);
+            query.execute(writer).await.unwrap();
             match open_to_read(&path).await.err().unwrap() {
                 CatalogError::OlderSchema { .. } => assert!(older),
                 CatalogError::NewerSchema { .. } => assert!(!older),

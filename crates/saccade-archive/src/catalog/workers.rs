@@ -1,0 +1,194 @@
+//! Workers share the records of a volume: claims, leases, signs of life.
+
+use std::time::{Duration, SystemTime};
+
+use super::database::{Database, Durability, Statement, Transaction};
+use super::{Catalog, CatalogError, Waiting, rows};
+
+/// One that claims records, as the catalog knows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Worker {
+    pub(super) id: i64,
+    name: String,
+    lease: Duration,
+}
+
+impl Worker {
+    /// What people call it.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// How long its claims last after its last sign of life.
+    pub fn lease(&self) -> Duration {
+        self.lease
+    }
+}
+
+/// A record that is one worker's for now.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Claim {
+    /// The record.
+    pub waiting: Waiting,
+    /// How often it was claimed since it was last known not to harm who works on it, this time
+    /// included. One that ends its workers is claimed again and again.
+    pub attempts: u32,
+    /// Whether its file was not whole when it was looked at last.
+    pub parked: bool,
+}
+
+impl Catalog {
+    /// A new worker. It has to give a sign of life, by [`Self::claim`] or [`Self::keep_alive`], before
+    /// `lease` is over, else what it claimed is free again.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn register(&self, name: &str, lease: Duration) -> Result<Worker, CatalogError> {
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        let now = self.now(&mut transaction).await?;
+        // Those that have been gone for a day are forgotten.
+        let day = Duration::from_secs(24 * 3600);
+        let ago = rows::millis(now.checked_sub(day).unwrap_or(SystemTime::UNIX_EPOCH));
+        let forget = "DELETE FROM workers WHERE lease < $1";
+        let forgotten = transaction.run(forget, &[ago.into()]).await;
+        forgotten.map_err(|e| self.failed(e))?;
+        let insert = "INSERT INTO workers (name, lease) VALUES ($1, $2) RETURNING id";
+        let until = rows::millis(now + lease);
+        let row = transaction.one(insert, &[name.into(), until.into()]).await;
+        let id = row.and_then(|row| row.ok_or(sqlx::Error::RowNotFound)?.get("id"));
+        let id = id.map_err(|e| self.failed(e))?;
+        transaction.commit().await.map_err(|e| self.failed(e))?;
+        Ok(Worker {
+            id,
+            name: name.to_owned(),
+            lease,
+        })
+    }
+
+    /// A sign of life.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn keep_alive(&self, worker: &Worker) -> Result<(), CatalogError> {
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        self.renew(&mut transaction, worker).await?;
+        transaction.commit().await.map_err(|e| self.failed(e))
+    }
+
+    /// Claims the first records of a volume that nobody has, at most `max`, by position: no other
+    /// worker gets them until this one is done with them or its lease is over. Also a sign of life.
+    ///
+    /// A record is left alone while an older one of the same tile is being worked on, so that what
+    /// becomes of a tile does not depend on who is faster.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn claim(
+        &self,
+        volume: &str,
+        worker: &Worker,
+        max: u32,
+    ) -> Result<Vec<Claim>, CatalogError> {
+        let volume = self.volume_id(volume).await?;
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        let now = self.renew(&mut transaction, worker).await?;
+        let claim = Statement {
+            sqlite: "WITH free AS MATERIALIZED ( \
+                       SELECT w.position FROM waiting w WHERE w.volume = $1 \
+                         AND NOT EXISTS (SELECT 1 FROM workers k WHERE k.id = w.worker AND k.lease >= $3) \
+                         AND NOT EXISTS (SELECT 1 FROM waiting o WHERE o.volume = w.volume \
+                           AND o.tile = w.tile AND o.position < w.position AND o.parked = 0) \
+                       ORDER BY w.position LIMIT $4) \
+                     UPDATE waiting SET worker = $2, attempts = attempts + 1 \
+                     WHERE volume = $1 AND position IN (SELECT position FROM free) \
+                     RETURNING position, record, reason, attempts, parked",
+            // What another is claiming right now is passed over rather than waited for.
+            postgres: "WITH free AS MATERIALIZED ( \
+                         SELECT w.position FROM waiting w WHERE w.volume = $1 \
+                           AND NOT EXISTS (SELECT 1 FROM workers k WHERE k.id = w.worker AND k.lease >= $3) \
+                           AND NOT EXISTS (SELECT 1 FROM waiting o WHERE o.volume = w.volume \
+                             AND o.tile = w.tile AND o.position < w.position AND o.parked = 0) \
+                         ORDER BY w.position LIMIT $4 FOR UPDATE OF w SKIP LOCKED) \
+                       UPDATE waiting SET worker = $2, attempts = attempts + 1 \
+                       WHERE volume = $1 AND position IN (SELECT position FROM free) \
+                       RETURNING position, record, reason, attempts, parked",
+        };
+        let values = [
+            volume.into(),
+            worker.id.into(),
+            rows::millis(now).into(),
+            max.into(),
+        ];
+        let claimed = transaction.all(claim, &values).await;
+        let claims = claimed.and_then(|rows| rows.iter().map(rows::claim).collect());
+        let mut claims: Vec<Claim> = claims.map_err(|e| self.failed(e))?;
+        transaction.commit().await.map_err(|e| self.failed(e))?;
+        claims.sort_by_key(|claim| claim.waiting.position);
+        Ok(claims)
+    }
+
+    /// Gives back all that the worker has claimed, as if it had never been claimed.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn release(&self, worker: &Worker) -> Result<(), CatalogError> {
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        for release in [
+            "UPDATE waiting SET worker = NULL, attempts = attempts - 1 \
+             WHERE worker = $1 AND attempts > 0",
+            "UPDATE waiting SET worker = NULL WHERE worker = $1",
+            "DELETE FROM workers WHERE id = $1",
+        ] {
+            let done = transaction.run(release, &[worker.id.into()]).await;
+            done.map_err(|e| self.failed(e))?;
+        }
+        transaction.commit().await.map_err(|e| self.failed(e))
+    }
+
+    /// Records of a volume that are to be worked on, claimed or not, and those whose file is not
+    /// whole.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn queued(&self, volume: &str) -> Result<(u64, u64), CatalogError> {
+        let statistics = self.statistics(volume).await?;
+        Ok((statistics.queued, statistics.waiting))
+    }
+
+    async fn renew(
+        &self,
+        transaction: &mut Transaction,
+        worker: &Worker,
+    ) -> Result<SystemTime, CatalogError> {
+        let now = self.now(transaction).await?;
+        let renew = "INSERT INTO workers (id, name, lease) VALUES ($1, $2, $3) \
+                     ON CONFLICT (id) DO UPDATE SET lease = excluded.lease";
+        let until = rows::millis(now + worker.lease).into();
+        let values = [worker.id.into(), (&worker.name).into(), until];
+        let renewed = transaction.run(renew, &values).await;
+        renewed.map_err(|e| self.failed(e))?;
+        Ok(now)
+    }
+
+    /// Where several machines share a catalog, their clocks differ: the server's counts.
+    async fn now(&self, transaction: &mut Transaction) -> Result<SystemTime, CatalogError> {
+        if let Some(clock) = self.inner.clock.get() {
+            return Ok(clock.now());
+        }
+        match &self.inner.database {
+            Database::Sqlite(_) => Ok(SystemTime::now()),
+            Database::Postgres(_) => {
+                let ask = "SELECT (extract(epoch FROM clock_timestamp()) * 1000)::bigint AS now";
+                let row = transaction.one(ask, &[]).await;
+                let now =
+                    row.and_then(|row| rows::time(&row.ok_or(sqlx::Error::RowNotFound)?, "now"));
+                now.map_err(|e| self.failed(e))
+            }
+        }
+    }
+}

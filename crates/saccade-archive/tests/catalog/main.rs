@@ -1,0 +1,59 @@
+//! What the catalog promises, on SQLite and on PostgreSQL: order, revisions, boxes, all or nothing,
+//! several processes, several workers.
+
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+#![expect(clippy::cast_possible_truncation, reason = "small whole numbers")]
+
+mod place;
+#[path = "../support/postgres.rs"]
+mod postgres;
+mod properties;
+mod server;
+mod sqlite;
+mod suite;
+mod workers;
+
+/// Each of these promises holds wherever a catalog is.
+macro_rules! on_both {
+    ($($module:ident::$name:ident),* $(,)?) => {
+        mod on_sqlite {
+            $(#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+            async fn $name() {
+                crate::$module::$name(&crate::place::Place::file()).await;
+            })*
+        }
+        mod on_postgres {
+            $(#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+            async fn $name() {
+                if let Some(place) = crate::place::Place::database().await {
+                    crate::$module::$name(&place).await;
+                }
+            })*
+        }
+    };
+}
+
+on_both! {
+    suite::a_tile_is_what_was_entered,
+    suite::a_moved_tile_changes_its_old_and_its_new_place,
+    suite::nothing_leaves_the_volume,
+    suite::an_early_transform_waits_for_its_tile,
+    suite::a_deleted_tile_is_gone_until_a_later_record_brings_it_back,
+    suite::channels_stay_apart,
+    suite::a_replaced_pyramid_is_retired_not_forgotten,
+    suite::a_commit_happens_whole_or_not_at_all,
+    suite::tiles_are_found_by_id,
+    suite::sections_are_those_with_tiles,
+    suite::long_histories_come_in_pieces_without_gaps,
+    suite::other_processes_commits_are_heard,
+    suite::several_writers_take_turns,
+    suite::other_sizes_and_unknown_names_are_refused,
+    workers::workers_share_what_is_to_be_done,
+    workers::a_dead_workers_claims_return,
+    workers::a_sign_of_life_keeps_claims,
+    workers::records_of_a_tile_are_worked_on_in_order,
+    workers::who_leaves_gives_back,
+    workers::records_are_read_once,
+    workers::old_changes_are_forgotten_and_said_to_be,
+    workers::workers_that_die_lose_nothing,
+}
