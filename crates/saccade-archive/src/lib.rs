@@ -40,7 +40,7 @@ pub mod storage;
 pub mod tls;
 mod visualization;
 
+pub use catalog::CatalogLocation;
 pub use visualization::{
-    ArchiveError, ArchiveLocation, CatalogLocation, LocationError, StorageLocation,
-    VisualizationArchive,
+    ArchiveError, ArchiveLocation, LocationError, StorageLocation, VisualizationArchive,
 };

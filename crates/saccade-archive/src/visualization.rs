@@ -6,10 +6,10 @@ use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use crate::catalog::{Catalog, CatalogError};
+use crate::catalog::{Catalog, CatalogError, CatalogLocation};
 use crate::storage::{LocalStorage, ObjectStorage, Storage, StorageError};
 
-pub use location::{ArchiveLocation, CatalogLocation, LocationError, StorageLocation};
+pub use location::{ArchiveLocation, LocationError, StorageLocation};
 
 /// An open archive. Clones share it.
 #[derive(Clone, Debug)]
@@ -58,13 +58,12 @@ impl VisualizationArchive {
     /// [`ArchiveError`].
     pub async fn open(location: impl Into<ArchiveLocation>) -> Result<Self, ArchiveError> {
         let location = location.into();
-        let CatalogLocation::File(file) = location.catalog();
-        if !file.is_file() {
-            return Err(ArchiveError::NotAnArchive {
+        match location.catalog() {
+            CatalogLocation::File(file) if !file.is_file() => Err(ArchiveError::NotAnArchive {
                 path: file.to_owned(),
-            });
+            }),
+            _ => Self::open_parts(&location, false).await,
         }
-        Self::open_parts(&location).await
     }
 
     /// Opens an archive, and makes it first if there is none.
@@ -74,21 +73,28 @@ impl VisualizationArchive {
     /// [`ArchiveError`].
     pub async fn create(location: impl Into<ArchiveLocation>) -> Result<Self, ArchiveError> {
         let location = location.into();
-        let CatalogLocation::File(file) = location.catalog();
-        if let Some(folder) = file.parent() {
+        if let CatalogLocation::File(file) = location.catalog()
+            && let Some(folder) = file.parent()
+        {
             std::fs::create_dir_all(folder).map_err(|source| ArchiveError::Folder {
                 source,
                 path: folder.to_owned(),
             })?;
         }
-        Self::open_parts(&location).await
+        Self::open_parts(&location, true).await
     }
 
-    async fn open_parts(location: &ArchiveLocation) -> Result<Self, ArchiveError> {
-        let CatalogLocation::File(file) = location.catalog();
+    async fn open_parts(location: &ArchiveLocation, create: bool) -> Result<Self, ArchiveError> {
+        let catalog = async || {
+            if create {
+                Catalog::create(location.catalog()).await
+            } else {
+                Catalog::open(location.catalog()).await
+            }
+        };
         match location.storage() {
             StorageLocation::Folder(folder) => {
-                let catalog = Catalog::create(file).await?;
+                let catalog = catalog().await?;
                 let storage = Arc::new(LocalStorage::new(folder)?);
                 Ok(Self { catalog, storage })
             }
@@ -96,7 +102,7 @@ impl VisualizationArchive {
                 // Before a catalog is made: a wrong address should not leave one behind.
                 let storage = ObjectStorage::s3(bucket)?;
                 storage.check().await?;
-                let catalog = Catalog::create(file).await?;
+                let catalog = catalog().await?;
                 let storage = Arc::new(storage);
                 Ok(Self { catalog, storage })
             }

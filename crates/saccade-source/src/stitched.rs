@@ -217,7 +217,7 @@ impl StitchedSource {
         let tiles = Tiles::new(archive, index, volume.dtype, &options);
         let disk = match options.disk_cache.clone() {
             Some(disk) => {
-                let place = catalog.path().display().to_string();
+                let place = catalog.location().to_string();
                 let identity = disk_cache::identity(&**archive.storage()).await;
                 identity.map(|identity| (disk, [&identity[..], place.as_bytes()].concat()))
             }

@@ -23,9 +23,9 @@ pub(crate) struct Archive {
 /// Where the catalog is, if it is not in the archive's folder.
 #[derive(Args, Clone)]
 pub(crate) struct CatalogArgument {
-    /// The catalog's file on a local disk, where the archive is in an object store
-    /// [default: catalog.sqlite in the archive's folder]
-    #[arg(long, value_name = "FILE")]
+    /// The catalog: a file on a local disk, or a PostgreSQL database that several machines share, as
+    /// postgres://USER:PASSWORD@HOST/DATABASE [default: catalog.sqlite in the archive's folder]
+    #[arg(long, value_name = "FILE|URL")]
     catalog: Option<CatalogLocation>,
 }
 

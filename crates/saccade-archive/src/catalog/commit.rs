@@ -377,6 +377,18 @@ impl<'c> Commit<'c> {
         Ok(())
     }
 
+    /// Whether a record of that tile is still to be worked on; one whose file is not whole does not count.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn is_queued(&mut self, tile: &str) -> Result<bool, CatalogError> {
+        let question = "SELECT position FROM waiting \
+                        WHERE volume = $1 AND tile = $2 AND parked = 0 LIMIT 1";
+        let values = [self.volume.into(), tile.into()];
+        Ok(self.one(question, &values).await?.is_some())
+    }
+
     /// Whether a claimed record is still the worker's: if its lease was over for a while, another may
     /// have it, or be done with it. What it became is then another's to say.
     ///

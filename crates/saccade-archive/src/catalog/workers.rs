@@ -2,7 +2,7 @@
 
 use std::time::{Duration, SystemTime};
 
-use super::database::{Database, Durability, Statement, Transaction};
+use super::database::{Database, Durability, Row, Statement, Transaction};
 use super::{Catalog, CatalogError, Waiting, rows};
 
 /// One that claims records, as the catalog knows it.
@@ -156,8 +156,16 @@ impl Catalog {
     ///
     /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn queued(&self, volume: &str) -> Result<(u64, u64), CatalogError> {
-        let statistics = self.statistics(volume).await?;
-        Ok((statistics.queued, statistics.waiting))
+        let volume = self.volume_id(volume).await?;
+        let question = "SELECT parked, count(*) AS records FROM waiting WHERE volume = $1 \
+                        GROUP BY parked";
+        let understand = |row: &Row| {
+            let parked: i64 = row.get("parked")?;
+            Ok((parked != 0, rows::unsigned(row, "records")?))
+        };
+        let counts = self.ask(question, &[volume.into()], understand).await?;
+        let of = |parked| counts.iter().find(|c| c.0 == parked).map_or(0, |c| c.1);
+        Ok((of(false), of(true)))
     }
 
     async fn renew(

@@ -3,6 +3,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use super::VisualizationArchive;
+use crate::catalog::CatalogLocation;
 use crate::storage::{BucketLocation, BucketLocationError};
 
 /// Where pyramids lie: a folder, or `s3://bucket/prefix`.
@@ -12,13 +13,6 @@ pub enum StorageLocation {
     Folder(PathBuf),
     /// A bucket of an object store.
     Bucket(BucketLocation),
-}
-
-/// Where a catalog is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum CatalogLocation {
-    /// A file of SQLite's, on a local disk.
-    File(PathBuf),
 }
 
 /// Where an archive is: its pyramids, and the catalog that names them.
@@ -42,14 +36,18 @@ pub enum LocationError {
         text: String,
     },
     /// A catalog cannot be there.
-    #[error("{text:?} is no place for a catalog; name a file on a local disk")]
+    #[error(
+        "{text:?} is no place for a catalog; name a file on a local disk, or a database as \
+         postgres://USER:PASSWORD@HOST/DATABASE"
+    )]
     CatalogScheme {
         /// As given.
         text: String,
     },
     /// A bucket holds no catalog.
     #[error(
-        "the catalog of {storage} cannot be in the bucket; name a local file with --catalog FILE"
+        "the catalog of {storage} cannot be in the bucket; name a local file with --catalog FILE, or a \
+         database with --catalog postgres://USER:PASSWORD@HOST/DATABASE"
     )]
     NoCatalog {
         /// Where the pyramids are.
@@ -76,11 +74,12 @@ impl FromStr for CatalogLocation {
     type Err = LocationError;
 
     fn from_str(text: &str) -> Result<Self, LocationError> {
-        if text.contains("://") {
-            let text = text.to_owned();
-            Err(LocationError::CatalogScheme { text })
-        } else {
-            Ok(Self::File(text.into()))
+        match Self::parse(text) {
+            Self::File(_) if text.contains("://") => {
+                let text = text.to_owned();
+                Err(LocationError::CatalogScheme { text })
+            }
+            location => Ok(location),
         }
     }
 }
@@ -146,14 +145,6 @@ impl fmt::Display for StorageLocation {
         match self {
             Self::Folder(folder) => folder.display().fmt(f),
             Self::Bucket(bucket) => bucket.fmt(f),
-        }
-    }
-}
-
-impl fmt::Display for CatalogLocation {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::File(file) => file.display().fmt(f),
         }
     }
 }

@@ -31,24 +31,4 @@ pub enum IngestError {
         /// The tile.
         tile: String,
     },
-    /// Two at work on one volume would do everything twice.
-    #[error(
-        "another process is ingesting into volume {volume:?}; end it first, or use another archive \
-         folder: {}",
-        path.display()
-    )]
-    AlreadyRunning {
-        /// The volume.
-        volume: String,
-        /// The file that the other one has locked.
-        path: PathBuf,
-    },
-    /// The lock file cannot be made.
-    #[error("cannot lock the archive; check its permissions and free space: {}", path.display())]
-    Lock {
-        /// What the system says.
-        source: std::io::Error,
-        /// The lock file.
-        path: PathBuf,
-    },
 }

@@ -21,6 +21,11 @@ pub struct IngestOptions {
     pub batch: usize,
     /// First pause after a failed write; pauses double up to sixteen of it.
     pub retry: Duration,
+    /// How long what a worker has claimed stays its own after its last sign of life. Such a sign is
+    /// given four times as often.
+    pub lease: Duration,
+    /// Workers that may end while they work on a record, before it goes to quarantine.
+    pub attempts: u32,
     /// How long a replaced pyramid stays, for readers that still have its name.
     pub keep_retired: Duration,
 }
@@ -36,6 +41,8 @@ impl IngestOptions {
         patience: 120,
         batch: 1024,
         retry: Duration::from_secs(1),
+        lease: Duration::from_secs(20),
+        attempts: 5,
         keep_retired: Duration::from_secs(60),
     };
 }

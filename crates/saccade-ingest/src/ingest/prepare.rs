@@ -61,6 +61,17 @@ pub(super) enum Outcome {
     },
 }
 
+impl Outcome {
+    /// The tile of a record that is about one which is there already.
+    pub(super) fn tile(&self) -> Option<&str> {
+        match self {
+            Self::Transform { record, .. } => Some(&record.tile),
+            Self::Delete { record, .. } => Some(&record.tile),
+            Self::Tile { .. } | Self::Wait { .. } | Self::Quarantine { .. } => None,
+        }
+    }
+}
+
 /// How long to wait for a file that does not change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum WaitKind {

@@ -1,39 +1,38 @@
-//! The loop: look, prepare several records at once, commit them in order.
+//! The loop: read what is new, claim records, work on several at once, enter them as they get ready.
 
-use std::fs::File;
-use std::future::Future;
+use std::collections::VecDeque;
 use std::path::Path;
 use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::SystemTime;
 
+use futures::TryStreamExt;
 use futures::future::{Either, select};
-use futures::{StreamExt, TryStreamExt};
+use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{
-    AcquisitionError, AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
+    AcquisitionError, AcquisitionInfo, Record, RecordLine, RecordReader, TileRecord,
 };
-use saccade_archive::catalog::{
-    CatalogError, CatalogLocation, DeleteOutcome, Quarantined, TileOutcome, TransformOutcome,
-};
+use saccade_archive::catalog::{Claim, Quarantined, Waiting, Worker};
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 
-use super::prepare::{Backoff, Context, Outcome, Stored};
+use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, retry};
+use super::prepare::{Backoff, Context, Outcome, Stored, quarantine};
 use super::waiting::{Due, WaitingRoom};
 use super::{IngestError, IngestOptions};
 use crate::cancel::Cancel;
 use crate::progress::{Meter, Progress, State};
-
-/// Most records in one transaction: a sync for each would be slow for small tiles, and a
-/// transaction for thousands would keep other writers waiting.
-const COMMIT_AT_ONCE: usize = 64;
 
 /// Retired pyramids deleted per look.
 const DELETE_AT_ONCE: u32 = 64;
 
 /// Attempts at reading the records when all that is there is to be done once.
 const ATTEMPTS_ONCE: u32 = 4;
+
+/// Attempts at a record after which it is worked on alone, so that if it ends its worker, no other
+/// comes under suspicion.
+const SUSPECT: u32 = 3;
 
 /// What was done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -56,11 +55,14 @@ pub struct Summary {
 ///
 /// The volume is made if the catalog does not have it. A tile is acknowledged, in `progress` and by
 /// the volume's revision, once its pyramid and its catalog entry would survive a power cut. When
-/// the returned future is dropped, it ends like a killed process: safely.
+/// the returned future is dropped, it ends like a killed process: safely. Any number may work on one
+/// volume, in one process or on several machines that share catalog and storage: each record is
+/// worked on by one of them.
 ///
 /// # Errors
 ///
-/// [`IngestError`]; never for a bad tile, and not for a full disk, which is waited out.
+/// [`IngestError`]; never for a bad tile, and not for a full disk or a catalog's server that is away,
+/// which are waited out.
 pub async fn run(
     acquisition: &Path,
     archive: &VisualizationArchive,
@@ -79,16 +81,14 @@ pub async fn run(
         Some(name) => volume.name.clone_from(name),
         None => check_name(&volume.name).map_err(impossible)?,
     }
-    archive.catalog().create_volume(&volume).await?;
-    let _lock = lock(archive, &volume.name)?;
-
     let catalog = archive.catalog();
+    catalog.create_volume(&volume).await?;
     let (stored, why) = Stored::new(volume.dtype, info.kind, options.encoding);
     if let Some(why) = why {
         progress.notice(why);
     }
+    let worker = catalog.register(&worker_name(), options.lease).await?;
     let cursor = catalog.cursor(&volume.name).await?;
-    let waiting = catalog.waiting(&volume.name).await?;
     let mut ingest = Ingest {
         archive,
         options,
@@ -102,44 +102,46 @@ pub async fn run(
             retry: options.retry,
             progress,
         },
+        worker: &worker,
         reader: RecordReader::new(acquisition, cursor),
-        room: WaitingRoom::new(options.patience, options.poll, waiting),
+        room: WaitingRoom::new(options.patience, options.poll, Vec::new()),
         meter: Meter::new(),
         summary: Summary::default(),
         left: AtomicU64::new(0),
     };
-    {
+    let done = {
         let work = pin!(ingest.follow());
-        let stop = pin!(cancel.cancelled());
-        match select(work, stop).await {
-            Either::Left((result, _)) => result?,
-            Either::Right(_) => {}
+        let cancelled = pin!(cancel.cancelled());
+        let alive = pin!(keep_alive(archive, &worker));
+        match select(work, select(cancelled, alive)).await {
+            Either::Left((done, _)) => done,
+            Either::Right(_) => Ok(()),
         }
+    };
+    // Others need not wait for the lease. If this fails, they do.
+    let release = catalog.release(&worker);
+    match tokio::time::timeout(options.lease, release).await {
+        Ok(Ok(())) => {}
+        Ok(Err(e)) => log::warn!("claimed records are free again when the lease is over: {e}"),
+        Err(_) => log::warn!("claimed records are free again when the lease is over"),
     }
+    done?;
     ingest.summary.early = catalog.statistics(&volume.name).await?.early;
     Ok(ingest.summary)
 }
 
-/// One ingest at a time per volume. The system lets go of the lock when the process ends.
-fn lock(archive: &VisualizationArchive, volume: &str) -> Result<Option<File>, IngestError> {
-    let CatalogLocation::File(catalog) = archive.catalog().location() else {
-        return Ok(None);
-    };
-    let path = catalog.with_file_name(format!("ingest-{volume}.lock"));
-    let file = match File::create(&path) {
-        Ok(file) => file,
-        Err(source) => return Err(IngestError::Lock { source, path }),
-    };
-    match file.try_lock() {
-        Ok(()) => Ok(Some(file)),
-        Err(std::fs::TryLockError::WouldBlock) => Err(IngestError::AlreadyRunning {
-            volume: volume.to_owned(),
-            path,
-        }),
-        // Where there are no locks, the user keeps the order.
-        Err(std::fs::TryLockError::Error(e)) => {
-            log::warn!("cannot lock {}: {e}", path.display());
-            Ok(Some(file))
+/// What people call this worker.
+fn worker_name() -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    format!("{}:{}", host.trim(), std::process::id())
+}
+
+/// Gives signs of life, until dropped. Without them, others take over: that is what they are for.
+async fn keep_alive(archive: &VisualizationArchive, worker: &Worker) {
+    loop {
+        tokio::time::sleep(worker.lease() / 4).await;
+        if let Err(e) = archive.catalog().keep_alive(worker).await {
+            log::warn!("no sign of life could be given: {e}");
         }
     }
 }
@@ -148,19 +150,18 @@ struct Ingest<'a> {
     archive: &'a VisualizationArchive,
     options: &'a IngestOptions,
     context: Context<'a>,
+    worker: &'a Worker,
     reader: RecordReader,
     room: WaitingRoom,
     meter: Meter,
     summary: Summary,
-    /// Records read but not committed.
+    /// Records still to do, as far as this worker knows.
     left: AtomicU64,
 }
 
-/// A record on its way.
+/// A claimed record on its way.
 struct Job {
     position: u64,
-    /// Where reading goes on after it; `None` for one that has waited.
-    next: Option<Cursor>,
     work: Work,
 }
 
@@ -169,98 +170,79 @@ enum Work {
     Done(Outcome),
 }
 
-/// A record that is ready to be committed.
-struct Ready {
-    position: u64,
-    next: Option<Cursor>,
-    outcome: Outcome,
-}
-
 impl Ingest<'_> {
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
-            let lines = self.read().await?;
-            let read = lines.len();
-            let folder = self.context.folder;
-            let due = self.room.due(folder, self.options.batch);
-            let jobs: Vec<_> = due
-                .into_iter()
-                .map(Job::from)
-                .chain(lines.into_iter().map(Job::from))
-                .collect();
-            self.process(jobs).await?;
+            let due = self.room.due(self.context.folder, self.options.batch);
+            let due: VecDeque<_> = due.into_iter().map(Job::from).collect();
+            let worked = self.work(due).await?;
             self.delete_retired().await?;
-            self.report();
-            if read == 0 && self.options.once && self.room.len() == 0 {
+            let (queued, waiting) = self.count().await?;
+            self.left
+                .store(queued + self.reader.remaining_lines(), Ordering::Relaxed);
+            self.context.progress.update(&state(
+                &self.summary,
+                &self.meter,
+                &self.room,
+                &self.left,
+            ));
+            // Others may still be at work; should they die, it is this one's turn.
+            if worked == 0 && self.options.once && queued + waiting == 0 {
                 return Ok(());
             }
-            if read < self.options.batch {
+            if worked < self.options.batch {
                 tokio::time::sleep(self.options.poll).await;
             }
         }
     }
 
-    /// The next records. A share that fails for a moment does not end the stream.
-    async fn read(&mut self) -> Result<Vec<RecordLine>, IngestError> {
-        let mut backoff = Backoff::new(self.options.retry);
-        loop {
-            match self.reader.read(self.options.batch.max(1)) {
-                Ok(lines) => return Ok(lines),
-                Err(e) => {
-                    // Who waits for the end is told, rather than kept.
-                    let patient = !self.options.once || backoff.failures < ATTEMPTS_ONCE;
-                    let passing = patient && matches!(e, AcquisitionError::Read { .. });
-                    if !backoff.may_go_on(false, passing) {
-                        return Err(e.into());
-                    }
-                    backoff.say_and_wait(self.context.progress, &e).await;
-                }
-            }
-        }
-    }
-
-    /// Prepares records, several at once, and commits them in order as they get ready.
-    async fn process(&mut self, jobs: Vec<Job>) -> Result<(), IngestError> {
-        if jobs.is_empty() {
-            return Ok(());
-        }
-        self.left.store(jobs.len() as u64, Ordering::Relaxed);
-        let (sender, mut receiver) = mpsc::channel(COMMIT_AT_ONCE);
-        let context = &self.context;
-        let prepare = async {
-            // Moved in, so that it closes when the last record is ready.
-            let sender = sender;
-            let prepared = futures::stream::iter(jobs)
-                .map(|job| job.prepare(context))
-                .buffered(self.options.workers.max(1));
-            let mut prepared = pin!(prepared);
-            while let Some(ready) = prepared.try_next().await? {
-                if sender.send(ready).await.is_err() {
-                    break;
-                }
-            }
-            Ok::<_, IngestError>(())
-        };
-        let mut committer = Committer {
+    /// Works on records that are due, and on new ones, a batch at most: prepares several at once, and
+    /// enters them as they get ready. Returns how many records were worked on or read.
+    async fn work(&mut self, due: VecDeque<Job>) -> Result<usize, IngestError> {
+        let mut supply = Supply {
             archive: self.archive,
             options: self.options,
             context: &self.context,
-            reader: &self.reader,
+            worker: self.worker,
+            reader: &mut self.reader,
+            left: &self.left,
+            queue: due,
+            suspects: Vec::new(),
+            budget: self.options.batch.max(1),
+            worked: 0,
+            blocked: false,
+            summary: Summary::default(),
+        };
+        // What says where tiles lie, and which are gone, is not kept behind other tiles' images.
+        supply.read_ahead().await?;
+        let mut enter = Enter {
+            archive: self.archive,
+            options: self.options,
+            context: &self.context,
+            worker: self.worker,
             room: &mut self.room,
             meter: &mut self.meter,
             summary: &mut self.summary,
             left: &self.left,
         };
-        let commit = async {
-            let mut ready = Vec::new();
-            while receiver.recv_many(&mut ready, COMMIT_AT_ONCE).await > 0 {
-                committer.commit(std::mem::take(&mut ready)).await?;
-            }
-            Ok(())
-        };
-        // Both in this task: the work itself runs on blocking threads.
-        futures::try_join!(prepare, commit)?;
-        Ok(())
+        enter_all(&mut supply, &mut enter, self.options.workers.max(1)).await?;
+        for suspect in std::mem::take(&mut supply.suspects) {
+            supply.queue.push_back(suspect);
+            supply.budget = 0;
+            enter_all(&mut supply, &mut enter, 1).await?;
+        }
+        // What waits for others is still to be done.
+        let worked = supply.worked.max(usize::from(supply.blocked));
+        let read = supply.summary;
+        self.summary.moved += read.moved;
+        self.summary.deleted += read.deleted;
+        self.summary.quarantined += read.quarantined;
+        Ok(worked)
+    }
+
+    async fn count(&self) -> Result<(u64, u64), IngestError> {
+        let count = || self.archive.catalog().queued(self.context.volume);
+        Ok(retry(self.options, self.context.progress, count).await?)
     }
 
     /// Deletes pyramids that nobody should be reading any more.
@@ -292,58 +274,220 @@ impl Ingest<'_> {
         .await?;
         Ok(())
     }
-
-    fn report(&self) {
-        self.context.progress.update(&state(
-            &self.summary,
-            &self.meter,
-            &self.room,
-            self.reader.remaining_lines(),
-        ));
-    }
 }
 
-fn state(summary: &Summary, meter: &Meter, room: &WaitingRoom, queued: u64) -> State {
+pub(super) fn state(
+    summary: &Summary,
+    meter: &Meter,
+    room: &WaitingRoom,
+    left: &AtomicU64,
+) -> State {
     State {
         tiles: summary.tiles,
         pixels: summary.pixels,
-        queued,
+        queued: left.load(Ordering::Relaxed),
         waiting: room.len(),
         quarantined: summary.quarantined,
         mpixel_per_s: meter.mpixel_per_s(),
     }
 }
 
-/// Tries a transaction again while the disk is full, and some times if the failure may pass.
-async fn retry<T, F>(
-    options: &IngestOptions,
-    progress: &dyn Progress,
-    mut transaction: impl FnMut() -> F,
-) -> Result<T, CatalogError>
-where
-    F: Future<Output = Result<T, CatalogError>>,
-{
-    let mut backoff = Backoff::new(options.retry);
-    loop {
-        match transaction().await {
-            Ok(value) => return Ok(value),
-            Err(e) => {
-                if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
-                    return Err(e);
+/// Where work comes from.
+struct Supply<'a> {
+    archive: &'a VisualizationArchive,
+    options: &'a IngestOptions,
+    context: &'a Context<'a>,
+    worker: &'a Worker,
+    reader: &'a mut RecordReader,
+    left: &'a AtomicU64,
+    queue: VecDeque<Job>,
+    /// To be worked on alone, at the end.
+    suspects: Vec<Job>,
+    /// Records that may still be claimed before it is time to look after those that wait.
+    budget: usize,
+    worked: usize,
+    /// Whether there are records that have to wait for others.
+    blocked: bool,
+    /// Of what was done while reading.
+    summary: Summary,
+}
+
+impl Supply<'_> {
+    async fn next(&mut self) -> Result<Option<Job>, IngestError> {
+        if self.queue.is_empty() && self.budget > 0 && self.suspects.is_empty() {
+            let mut claimed = self.claim().await?;
+            if claimed == 0 && self.read_ahead().await? {
+                claimed = self.claim().await?;
+            }
+            self.budget = self.budget.saturating_sub(claimed);
+        }
+        let job = self.queue.pop_front();
+        self.worked += usize::from(job.is_some());
+        Ok(job)
+    }
+
+    async fn claim(&mut self) -> Result<usize, IngestError> {
+        let (options, progress) = (self.options, self.context.progress);
+        // A few more than are worked on at once: each claim is a question to the catalog, but what is
+        // claimed and waits is nobody else's.
+        let most = (4 * options.workers.max(1)).min(self.budget);
+        let most = u32::try_from(most).unwrap_or(u32::MAX);
+        let (catalog, volume) = (self.archive.catalog(), self.context.volume);
+        let claim = || catalog.claim(volume, self.worker, most);
+        let claims = retry(options, progress, claim).await?;
+        let claimed = claims.len();
+        for claim in claims {
+            let attempts = claim.attempts;
+            let job = Job::claimed(claim, options);
+            if attempts >= SUSPECT {
+                self.suspects.push(job);
+            } else {
+                self.queue.push_back(job);
+            }
+        }
+        Ok(claimed)
+    }
+
+    /// Reads new records: tiles are put in the queue, the rest is done with at once, up to one that
+    /// speaks of a tile whose older records are still in the queue. Whether there were any.
+    async fn read_ahead(&mut self) -> Result<bool, IngestError> {
+        let (options, progress) = (self.options, self.context.progress);
+        let (catalog, volume) = (self.archive.catalog(), self.context.volume);
+        let batch = options.batch.max(1);
+        let (queued, _) = retry(options, progress, || catalog.queued(volume)).await?;
+        if queued >= batch as u64 {
+            return Ok(false);
+        }
+        // Another worker may have read on.
+        let from = retry(options, progress, || catalog.cursor(volume)).await?;
+        if self.reader.cursor() != from {
+            *self.reader = RecordReader::new(self.context.folder, from);
+        }
+        let lines = self.read(batch).await?;
+        self.blocked = false;
+        if lines.is_empty() {
+            self.left.store(queued, Ordering::Relaxed);
+            return Ok(false);
+        }
+        let lines: Vec<_> = lines.into_iter().map(|l| (l.next, New::from(l))).collect();
+        let (taken, done) = retry(options, progress, async || {
+            let mut commit = catalog.begin(volume).await?;
+            let mut done = Done::default();
+            let (mut taken, mut to) = (0, from);
+            for (next, line) in &lines {
+                match line {
+                    New::Tile(waiting) => commit.enqueue(waiting).await?,
+                    New::Done(outcome) => {
+                        // It is about what the tile is once all that came before is done.
+                        let tile = outcome.tile();
+                        if tile.is_some() && commit.is_queued(tile.unwrap_or_default()).await? {
+                            break;
+                        }
+                        done.apply(&mut commit, outcome).await?;
+                    }
                 }
-                backoff.say_and_wait(progress, &e).await;
+                (taken, to) = (taken + 1, *next);
+            }
+            if taken == 0 || !commit.advance(from, to).await? {
+                return Ok((0, Done::default()));
+            }
+            commit.finish().await?;
+            Ok((taken, done))
+        })
+        .await?;
+        self.blocked = taken < lines.len();
+        for notice in &done.notices {
+            progress.notice(notice);
+        }
+        let at_once = lines[..taken]
+            .iter()
+            .filter(|(_, l)| matches!(l, New::Done(_)));
+        self.worked += at_once.count();
+        self.summary.moved += done.summary.moved;
+        self.summary.deleted += done.summary.deleted;
+        self.summary.quarantined += done.summary.quarantined;
+        let left = queued + lines.len() as u64 + self.reader.remaining_lines();
+        self.left.store(left, Ordering::Relaxed);
+        Ok(taken > 0)
+    }
+
+    /// The next records. A share that fails for a moment does not end the stream.
+    async fn read(&mut self, max: usize) -> Result<Vec<RecordLine>, IngestError> {
+        let mut backoff = Backoff::new(self.options.retry);
+        loop {
+            match self.reader.read(max) {
+                Ok(lines) => return Ok(lines),
+                Err(e) => {
+                    // Who waits for the end is told, rather than kept.
+                    let patient = !self.options.once || backoff.failures < ATTEMPTS_ONCE;
+                    let passing = patient && matches!(e, AcquisitionError::Read { .. });
+                    if !backoff.may_go_on(false, passing) {
+                        return Err(e.into());
+                    }
+                    backoff.say_and_wait(self.context.progress, &e).await;
+                }
             }
         }
     }
 }
 
-impl From<RecordLine> for Job {
+/// Works on all there is, `workers` at once.
+async fn enter_all(
+    supply: &mut Supply<'_>,
+    enter: &mut Enter<'_>,
+    workers: usize,
+) -> Result<(), IngestError> {
+    let context = supply.context;
+    let (sender, mut receiver) = mpsc::channel(COMMIT_AT_ONCE);
+    let prepare = async {
+        // Moved in, so that it closes when the last record is ready.
+        let sender = sender;
+        // They end in whatever order they get ready: what becomes of a tile follows from its records.
+        let mut busy = FuturesUnordered::new();
+        loop {
+            while busy.len() < workers
+                && let Some(job) = supply.next().await?
+            {
+                busy.push(job.prepare(context));
+            }
+            let Some(ready) = busy.try_next().await? else {
+                break;
+            };
+            if sender.send(ready).await.is_err() {
+                break;
+            }
+        }
+        Ok::<_, IngestError>(())
+    };
+    let commit = async {
+        let mut ready = Vec::new();
+        while receiver.recv_many(&mut ready, COMMIT_AT_ONCE).await > 0 {
+            enter.commit(std::mem::take(&mut ready)).await?;
+        }
+        Ok(())
+    };
+    // Both in this task: the work itself runs on blocking threads.
+    futures::try_join!(prepare, commit)?;
+    Ok(())
+}
+
+/// A record that was read just now.
+enum New {
+    Tile(Waiting),
+    Done(Outcome),
+}
+
+impl From<RecordLine> for New {
     fn from(line: RecordLine) -> Self {
         let position = line.offset;
-        let work = match line.record {
-            Ok(Record::Tile(record)) => Work::Tile(record),
-            Ok(Record::Transform(record)) => Work::Done(Outcome::Transform { record, position }),
-            Ok(Record::Delete(record)) => Work::Done(Outcome::Delete { record, position }),
+        match line.record {
+            Ok(Record::Tile(record)) => Self::Tile(Waiting {
+                position,
+                record,
+                reason: "its turn has not come".to_owned(),
+            }),
+            Ok(Record::Transform(record)) => Self::Done(Outcome::Transform { record, position }),
+            Ok(Record::Delete(record)) => Self::Done(Outcome::Delete { record, position }),
             Err(broken) => {
                 let what = Quarantined {
                     file: RecordReader::FILE.to_owned(),
@@ -352,16 +496,11 @@ impl From<RecordLine> for Job {
                     bytes: Some(line.next.offset - line.offset),
                     at: SystemTime::now(),
                 };
-                Work::Done(Outcome::Quarantine {
+                Self::Done(Outcome::Quarantine {
                     what,
                     pyramid: None,
                 })
             }
-        };
-        Self {
-            position,
-            next: Some(line.next),
-            work,
         }
     }
 }
@@ -371,12 +510,10 @@ impl From<Due> for Job {
         match due {
             Due::Retry(waiting) => Self {
                 position: waiting.position,
-                next: None,
                 work: Work::Tile(waiting.record),
             },
             Due::GiveUp { position, outcome } => Self {
                 position,
-                next: None,
                 work: Work::Done(outcome),
             },
         }
@@ -384,159 +521,34 @@ impl From<Due> for Job {
 }
 
 impl Job {
+    fn claimed(claim: Claim, options: &IngestOptions) -> Self {
+        let Claim {
+            waiting: Waiting {
+                position, record, ..
+            },
+            attempts,
+            ..
+        } = claim;
+        let work = if attempts > options.attempts {
+            let reason = format!(
+                "{} workers ended while they worked on it; look at the image, and append its record \
+                 again",
+                attempts - 1
+            );
+            Work::Done(quarantine(&record, reason, None, None))
+        } else {
+            Work::Tile(record)
+        };
+        Self { position, work }
+    }
+
     async fn prepare(self, context: &Context<'_>) -> Result<Ready, IngestError> {
-        let Self {
-            position,
-            next,
-            work,
-        } = self;
+        let Self { position, work } = self;
         let outcome = match work {
             Work::Tile(record) => context.tile(record, position).await?,
             Work::Done(outcome) => outcome,
         };
-        Ok(Ready {
-            position,
-            next,
-            outcome,
-        })
-    }
-}
-
-/// The second half of the pipeline.
-struct Committer<'a> {
-    archive: &'a VisualizationArchive,
-    options: &'a IngestOptions,
-    context: &'a Context<'a>,
-    reader: &'a RecordReader,
-    room: &'a mut WaitingRoom,
-    meter: &'a mut Meter,
-    summary: &'a mut Summary,
-    left: &'a AtomicU64,
-}
-
-/// What a transaction did.
-#[derive(Default)]
-struct Done {
-    summary: Summary,
-    /// Pyramids that no tile names.
-    orphans: Vec<String>,
-    notices: Vec<String>,
-}
-
-impl Committer<'_> {
-    async fn commit(&mut self, ready: Vec<Ready>) -> Result<(), IngestError> {
-        let progress = self.context.progress;
-        let done = retry(self.options, progress, || self.transaction(&ready)).await?;
-        for notice in &done.notices {
-            progress.notice(notice);
-        }
-        for orphan in &done.orphans {
-            if let Err(e) = self.archive.storage().delete(orphan).await {
-                log::warn!("cannot delete the unused pyramid {orphan}: {e}");
-            }
-        }
-        self.summary.tiles += done.summary.tiles;
-        self.summary.pixels += done.summary.pixels;
-        self.summary.moved += done.summary.moved;
-        self.summary.deleted += done.summary.deleted;
-        self.summary.quarantined += done.summary.quarantined;
-        self.meter.add(done.summary.pixels);
-        let left = self.left.fetch_sub(ready.len() as u64, Ordering::Relaxed);
-        let left = left - ready.len() as u64;
-        for Ready {
-            position, outcome, ..
-        } in ready
-        {
-            match outcome {
-                Outcome::Wait {
-                    waiting,
-                    look,
-                    kind,
-                } => self.room.admit(waiting, look, kind),
-                _ => self.room.leave(position),
-            }
-        }
-        let queued = left + self.reader.remaining_lines();
-        progress.update(&state(self.summary, self.meter, self.room, queued));
-        Ok(())
-    }
-
-    async fn transaction(&self, ready: &[Ready]) -> Result<Done, CatalogError> {
-        let mut done = Done::default();
-        let mut commit = self.archive.catalog().begin(self.context.volume).await?;
-        for Ready {
-            position,
-            next,
-            outcome,
-        } in ready
-        {
-            match outcome {
-                Outcome::Tile { tile, pixels } => {
-                    match commit.tile(tile, SystemTime::now()).await? {
-                        TileOutcome::New | TileOutcome::Replaced => {
-                            done.summary.tiles += 1;
-                            done.summary.pixels += pixels;
-                        }
-                        TileOutcome::Superseded => done.orphans.push(tile.pyramid.clone()),
-                    }
-                }
-                Outcome::Transform { record, position } => {
-                    let moved = commit.transform(&record.tile, record.transform, Some(*position));
-                    match moved.await {
-                        Ok(TransformOutcome::Moved) => done.summary.moved += 1,
-                        Ok(TransformOutcome::Unchanged | TransformOutcome::Kept) => {}
-                        Err(outside @ CatalogError::OutsideVolume { .. }) => {
-                            let what = Quarantined {
-                                file: RecordReader::FILE.to_owned(),
-                                tile: Some(record.tile.clone()),
-                                reason: format!("{outside}; until then it stays where it is"),
-                                bytes: None,
-                                at: SystemTime::now(),
-                            };
-                            done.quarantine(&mut commit, &what).await?;
-                        }
-                        Err(e) => return Err(e),
-                    }
-                }
-                Outcome::Delete { record, position } => {
-                    let now = SystemTime::now();
-                    match commit.delete(&record.tile, *position, now).await? {
-                        DeleteOutcome::Deleted => done.summary.deleted += 1,
-                        DeleteOutcome::Unchanged | DeleteOutcome::Noted => {}
-                    }
-                }
-                Outcome::Wait { waiting, .. } => commit.wait(waiting).await?,
-                Outcome::Quarantine { what, pyramid } => {
-                    done.quarantine(&mut commit, what).await?;
-                    done.orphans.extend(pyramid.clone());
-                }
-            }
-            match (next, outcome) {
-                (Some(next), _) => commit.cursor(*next).await?,
-                (None, Outcome::Wait { .. }) => {}
-                (None, _) => commit.wait_no_more(*position).await?,
-            }
-        }
-        commit.finish().await?;
-        Ok(done)
-    }
-}
-
-impl Done {
-    async fn quarantine(
-        &mut self,
-        commit: &mut saccade_archive::catalog::Commit<'_>,
-        what: &Quarantined,
-    ) -> Result<(), CatalogError> {
-        commit.quarantine(what).await?;
-        self.summary.quarantined += 1;
-        let tile = what
-            .tile
-            .as_deref()
-            .map_or_else(String::new, |t| format!(" (tile {t})"));
-        self.notices
-            .push(format!("quarantined {}{tile}: {}", what.file, what.reason));
-        Ok(())
+        Ok(Ready { position, outcome })
     }
 }
 

@@ -7,6 +7,9 @@ mod faults;
 mod kill;
 mod kinds;
 mod mended;
+#[path = "../../../saccade-archive/tests/support/postgres.rs"]
+mod postgres;
 mod quarantine;
 mod scope;
 mod stream;
+mod workers;

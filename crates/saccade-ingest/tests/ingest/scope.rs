@@ -103,6 +103,7 @@ pub(crate) fn quick() -> IngestOptions {
         once: true,
         patience: 5,
         retry: Duration::from_millis(2),
+        lease: Duration::from_millis(300),
         ..IngestOptions::DEFAULT
     }
 }

@@ -312,36 +312,3 @@ async fn wrong_archives_are_refused() {
     let flat = fails(scope.path(), &quick()).await;
     assert!(matches!(flat, IngestError::Volume { .. }), "{flat}");
 }
-
-#[tokio::test]
-async fn two_at_once_are_refused() {
-    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
-    let archive = archive(folder.path()).await;
-    scope.tile("a", 0, SIZE, 1);
-    let cancel = Cancel::new();
-    let following = IngestOptions {
-        once: false,
-        ..quick()
-    };
-    let (first, second) = tokio::join!(
-        run(scope.path(), &archive, &following, &(), &cancel),
-        async {
-            while archive.catalog().revision(VOLUME).await.unwrap_or(0) == 0 {
-                tokio::time::sleep(Duration::from_millis(5)).await;
-            }
-            let second = run(scope.path(), &archive, &quick(), &(), &Cancel::new()).await;
-            cancel.cancel();
-            second
-        }
-    );
-    first.unwrap();
-    assert!(
-        matches!(second, Err(IngestError::AlreadyRunning { .. })),
-        "{second:?}"
-    );
-    assert_eq!(
-        scope.ingest(&archive).await,
-        Summary::default(),
-        "the lock is free again"
-    );
-}

@@ -216,7 +216,7 @@ impl TileIndex {
         // Whoever begins to load a section after these were read sees what is in the catalog now.
         let acquired = self.catalog.sections(&self.volume).await?;
         *lock(&self.acquired) = acquired.into_iter().collect();
-        lock(&self.sections).clear();
+        lock(&self.sections).retain(|_, _| false);
         Ok(())
     }
 

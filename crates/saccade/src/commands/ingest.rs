@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use clap::Args;
 use glam::{DVec2, DVec3, UVec3};
-use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::pyramid::Encoding;
+use saccade_archive::{CatalogLocation, VisualizationArchive};
 use saccade_core::volume::{Dtype, check_name};
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
 use saccade_ingest::watch::{self, Disk, Pattern, Watch, WatchConfig};
@@ -201,7 +201,14 @@ impl Ingest {
         let mut acquisition = self.acquisition.clone();
         let mut watching = None;
         if let Some(config) = bare {
-            let beside = archive.catalog().path().with_file_name("watched");
+            let beside = match (location.catalog(), location.folder()) {
+                (CatalogLocation::File(file), _) => file.with_file_name("watched"),
+                (CatalogLocation::Postgres(_), Some(folder)) => folder.join("watched"),
+                (CatalogLocation::Postgres(_), None) => anyhow::bail!(
+                    "what is found in a bare folder is kept beside the pyramids or the catalog, which \
+                     are both elsewhere: name a file with --catalog, or a folder as archive"
+                ),
+            };
             let kept = beside.join(&name);
             let mut watch = Watch::open(config, Disk, &self.acquisition, &kept)?;
             acquisition = kept;

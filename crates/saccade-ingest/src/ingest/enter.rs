@@ -1,0 +1,200 @@
+//! The second half of the pipeline: what became of records is entered in the catalog.
+
+use std::future::Future;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::SystemTime;
+
+use saccade_archive::VisualizationArchive;
+use saccade_archive::acquisition::RecordReader;
+use saccade_archive::catalog::{
+    CatalogError, Commit, DeleteOutcome, Quarantined, TileOutcome, TransformOutcome, Worker,
+};
+
+use super::prepare::{Backoff, Context, Outcome};
+use super::run::{Summary, state};
+use super::waiting::WaitingRoom;
+use super::{IngestError, IngestOptions};
+use crate::progress::{Meter, Progress};
+
+/// Most records in one transaction: a sync for each would be slow for small tiles, and a
+/// transaction for thousands would keep other writers waiting.
+pub(super) const COMMIT_AT_ONCE: usize = 64;
+
+/// A claimed record that is ready to be entered.
+pub(super) struct Ready {
+    pub(super) position: u64,
+    pub(super) outcome: Outcome,
+}
+
+/// Enters records.
+pub(super) struct Enter<'a> {
+    pub(super) archive: &'a VisualizationArchive,
+    pub(super) options: &'a IngestOptions,
+    pub(super) context: &'a Context<'a>,
+    pub(super) worker: &'a Worker,
+    pub(super) room: &'a mut WaitingRoom,
+    pub(super) meter: &'a mut Meter,
+    pub(super) summary: &'a mut Summary,
+    pub(super) left: &'a AtomicU64,
+}
+
+/// What a transaction did.
+#[derive(Default)]
+pub(super) struct Done {
+    pub(super) summary: Summary,
+    /// Pyramids that no tile names.
+    orphans: Vec<String>,
+    pub(super) notices: Vec<String>,
+    /// Records that are another worker's now.
+    lost: Vec<u64>,
+}
+
+impl Enter<'_> {
+    pub(super) async fn commit(&mut self, ready: Vec<Ready>) -> Result<(), IngestError> {
+        let progress = self.context.progress;
+        let done = retry(self.options, progress, || self.transaction(&ready)).await?;
+        for notice in &done.notices {
+            progress.notice(notice);
+        }
+        for orphan in &done.orphans {
+            if let Err(e) = self.archive.storage().delete(orphan).await {
+                log::warn!("cannot delete the unused pyramid {orphan}: {e}");
+            }
+        }
+        self.summary.tiles += done.summary.tiles;
+        self.summary.pixels += done.summary.pixels;
+        self.summary.moved += done.summary.moved;
+        self.summary.deleted += done.summary.deleted;
+        self.summary.quarantined += done.summary.quarantined;
+        self.meter.add(done.summary.pixels);
+        let left = self.left.load(Ordering::Relaxed);
+        let left = left.saturating_sub(ready.len() as u64);
+        self.left.store(left, Ordering::Relaxed);
+        for Ready { position, outcome } in ready {
+            match outcome {
+                Outcome::Wait {
+                    waiting,
+                    look,
+                    kind,
+                } if !done.lost.contains(&position) => self.room.admit(waiting, look, kind),
+                _ => self.room.leave(position),
+            }
+        }
+        progress.update(&state(self.summary, self.meter, self.room, self.left));
+        Ok(())
+    }
+
+    async fn transaction(&self, ready: &[Ready]) -> Result<Done, CatalogError> {
+        let mut done = Done::default();
+        let mut commit = self.archive.catalog().begin(self.context.volume).await?;
+        for Ready { position, outcome } in ready {
+            // One that was away for longer than its lease has nothing to say any more. What it wrote
+            // has the name that the other one's has, and stays.
+            if !commit.holds(self.worker, *position).await? {
+                done.lost.push(*position);
+                continue;
+            }
+            done.apply(&mut commit, outcome).await?;
+            if !matches!(outcome, Outcome::Wait { .. }) {
+                commit.wait_no_more(*position).await?;
+            }
+        }
+        commit.finish().await?;
+        Ok(done)
+    }
+}
+
+impl Done {
+    /// Enters what became of a record.
+    pub(super) async fn apply(
+        &mut self,
+        commit: &mut Commit<'_>,
+        outcome: &Outcome,
+    ) -> Result<(), CatalogError> {
+        let now = SystemTime::now();
+        match outcome {
+            Outcome::Tile { tile, pixels } => match commit.tile(tile, now).await? {
+                TileOutcome::New | TileOutcome::Replaced => {
+                    self.summary.tiles += 1;
+                    self.summary.pixels += pixels;
+                }
+                TileOutcome::Superseded => self.orphans.push(tile.pyramid.clone()),
+            },
+            Outcome::Transform { record, position } => {
+                let moved = commit.transform(&record.tile, record.transform, Some(*position));
+                match moved.await {
+                    Ok(TransformOutcome::Moved) => self.summary.moved += 1,
+                    Ok(TransformOutcome::Unchanged | TransformOutcome::Kept) => {}
+                    Err(outside @ CatalogError::OutsideVolume { .. }) => {
+                        let what = Quarantined {
+                            file: RecordReader::FILE.to_owned(),
+                            tile: Some(record.tile.clone()),
+                            reason: format!("{outside}; until then it stays where it is"),
+                            bytes: None,
+                            at: now,
+                        };
+                        self.quarantine(commit, &what).await?;
+                    }
+                    Err(e) => return Err(e),
+                }
+            }
+            Outcome::Delete { record, position } => {
+                match commit.delete(&record.tile, *position, now).await? {
+                    DeleteOutcome::Deleted => self.summary.deleted += 1,
+                    DeleteOutcome::Unchanged | DeleteOutcome::Noted => {}
+                }
+            }
+            Outcome::Wait { waiting, .. } => commit.wait(waiting).await?,
+            Outcome::Quarantine { what, pyramid } => {
+                self.quarantine(commit, what).await?;
+                self.orphans.extend(pyramid.clone());
+            }
+        }
+        Ok(())
+    }
+
+    async fn quarantine(
+        &mut self,
+        commit: &mut Commit<'_>,
+        what: &Quarantined,
+    ) -> Result<(), CatalogError> {
+        commit.quarantine(what).await?;
+        self.summary.quarantined += 1;
+        let tile = what
+            .tile
+            .as_deref()
+            .map_or_else(String::new, |t| format!(" (tile {t})"));
+        self.notices
+            .push(format!("quarantined {}{tile}: {}", what.file, what.reason));
+        Ok(())
+    }
+}
+
+/// Tries a transaction again: some times if the failure may pass, and as long as the disk is full or
+/// the server away.
+pub(super) async fn retry<T, F>(
+    options: &IngestOptions,
+    progress: &dyn Progress,
+    mut transaction: impl FnMut() -> F,
+) -> Result<T, CatalogError>
+where
+    F: Future<Output = Result<T, CatalogError>>,
+{
+    let mut backoff = Backoff::new(options.retry);
+    loop {
+        match transaction().await {
+            Ok(value) => {
+                if backoff.failures > 0 {
+                    progress.notice("the catalog can be used again");
+                }
+                return Ok(value);
+            }
+            Err(e) => {
+                if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
+                    return Err(e);
+                }
+                backoff.say_and_wait(progress, &e).await;
+            }
+        }
+    }
+}
