@@ -506,6 +506,14 @@ impl Renderer {
         table.is_some_and(|(_, table)| table.hides_for_good(0, stored))
     }
 
+    /// Whether there are values of a channel that are not seen, so that it is worth knowing the bounds of a
+    /// brick's before it is delivered.
+    pub fn may_hide(&self, channel: u32) -> bool {
+        let mut seen = self.channels.iter();
+        let table = seen.find(|(view, _)| view.channel == channel);
+        self.octree.is_some() && table.is_some_and(|(_, table)| table.hides_for_good(0, 1))
+    }
+
     /// Level-0 voxels changed: their bricks are wanted again at all levels.
     ///
     /// Resident ones stay in the picture until their replacement is delivered, and count as missing.

@@ -25,6 +25,14 @@ pub(crate) struct VolumeEntry {
     pub(crate) revision: u64,
 }
 
+/// Bounds of chunks' values.
+#[derive(Debug, Serialize, ToSchema)]
+pub(crate) struct RangeList {
+    /// Least and greatest measured value of each chunk, in the order asked for; null where nothing was
+    /// acquired. They hold, and may be wider than they need be.
+    pub(crate) ranges: Vec<Option<[u16; 2]>>,
+}
+
 /// What a volume is, and which state of it is offered now.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct VolumeDescription {

@@ -15,17 +15,19 @@ use axum::middleware::{Next, from_fn_with_state, map_response};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
+use saccade_core::volume::Dtype;
+use saccade_source::ChunkId;
 use tokio::sync::{Semaphore, watch};
 use tower_http::CompressionLevel;
 use tower_http::compression::CompressionLayer;
 use tower_http::cors::{AllowOrigin, Any, CorsLayer};
 use utoipa::OpenApi;
 
-use crate::api::{Document, VolumeDescription, VolumeEntry, VolumeList};
+use crate::api::{Document, RangeList, VolumeDescription, VolumeEntry, VolumeList};
 use crate::assets::asset;
 use crate::events;
 use crate::formats::{Entry, Format, Unknown};
-use crate::http::{Refusal, internal, mark_encoding, not_found, try_again};
+use crate::http::{Refusal, internal, mark_encoding, not_found, refusal, try_again};
 use crate::index::index;
 use crate::pieces::piece;
 use crate::server::{Compress, Compressible, Gate, Options, Origins};
@@ -117,6 +119,7 @@ pub(crate) fn router(app: App) -> Router {
         .route("/v/{name}/status.json", get(status))
         .route("/v/{name}/events", get(changes))
         .route("/v/{name}/thumbnail.png", get(picture))
+        .route("/v/{name}/ranges/{channel}/{level}/{chunks}", get(ranges))
         .fallback(get(other))
         .layer(from_fn_with_state(app.clone(), spare_near_clients))
         .layer(gzip)
@@ -338,6 +341,66 @@ async fn other(State(app): State<App>, uri: Uri, headers: HeaderMap) -> Response
         }
         not_found(format!("there is nothing at {:?}", uri.path()), known)
     })
+}
+
+/// Chunks whose bounds can be asked for at once.
+const MOST_RANGES: usize = 256;
+
+/// Bounds of chunks' values, looked up without building the chunks: what a client does not show, it need
+/// not ask for.
+///
+/// Of the channel and level, chunks as x,y,z with semicolons between them, 256 at most. 400 where there are no
+/// such chunks, or too many.
+pub(crate) async fn ranges(
+    State(app): State<App>,
+    Path((name, channel, level, chunks)): Path<(String, u32, u32, String)>,
+) -> Response {
+    let published = match find(&app, &name) {
+        Ok(published) => published,
+        Err(refusal) => return *refusal,
+    };
+    let volume = published.volume().clone();
+    let parse = |text: &str| {
+        let axes: Vec<u32> = { text.split(',') }
+            .map(|n| n.parse().ok())
+            .collect::<Option<_>>()?;
+        let chunk = <[u32; 3]>::try_from(axes).ok()?.into();
+        let id = ChunkId {
+            channel,
+            level,
+            chunk,
+        };
+        id.voxels(&volume).map(|_| id)
+    };
+    let ids = chunks.split(';').map(parse).take(MOST_RANGES + 1);
+    let ids: Vec<ChunkId> = match ids.collect::<Option<_>>() {
+        Some(ids) => ids,
+        None => {
+            return bad_request(format!(
+                "the volume has not all of these chunks: {chunks:?}"
+            ));
+        }
+    };
+    if ids.len() > MOST_RANGES {
+        return bad_request(format!("ask for {MOST_RANGES} chunks at most"));
+    }
+    let most = match volume.dtype {
+        Dtype::Uint8 => u16::from(u8::MAX),
+        _ => u16::MAX,
+    };
+    let found = published.source.find_value_ranges(&ids).await;
+    let ranges = found.into_iter().map(|range| match range {
+        Ok(range) => range.map(|range| [range.min, range.max]),
+        // Whoever reads the chunk learns what is wrong with it.
+        Err(_) => Some([1, most]),
+    });
+    described(RangeList {
+        ranges: ranges.collect(),
+    })
+}
+
+fn bad_request(error: String) -> Response {
+    refusal(StatusCode::BAD_REQUEST, error, Vec::new())
 }
 
 fn find(app: &App, name: &str) -> Result<Arc<Published>, Box<Response>> {

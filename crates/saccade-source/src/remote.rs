@@ -4,6 +4,7 @@ mod chunks;
 mod client;
 mod event_parser;
 mod events;
+mod ranges;
 mod status;
 
 use std::sync::Arc;
@@ -19,7 +20,7 @@ use serde::de::DeserializeOwned;
 use crate::changes::Changes;
 use crate::conformance::check_volume;
 use crate::maybe_send::{BoxFuture, BoxStream, sleep, spawn};
-use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
+use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource};
 use chunks::Revisions;
 use client::client;
 
@@ -270,6 +271,24 @@ impl VolumeSource for RemoteSource {
 
     fn changes(&self) -> BoxStream<'static, Change> {
         self.changes.stream()
+    }
+
+    fn find_value_range(
+        &self,
+        id: ChunkId,
+    ) -> BoxFuture<'_, Result<Option<ValueRange>, ChunkError>> {
+        Box::pin(async move {
+            let mut found = self.ranges(&[id]).await;
+            found.pop().unwrap_or(Err(ChunkError::OutOfRange { id }))
+        })
+    }
+
+    /// Asks the server; where it does not answer, everything is possible.
+    fn find_value_ranges<'a>(
+        &'a self,
+        ids: &'a [ChunkId],
+    ) -> BoxFuture<'a, Vec<Result<Option<ValueRange>, ChunkError>>> {
+        Box::pin(self.ranges(ids))
     }
 
     fn revision(&self) -> u64 {

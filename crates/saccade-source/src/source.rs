@@ -3,12 +3,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use futures::stream::{self, StreamExt};
 use glam::UVec3;
 use saccade_core::volume::{Dtype, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use serde::{Deserialize, Serialize};
 
 use crate::maybe_send::{BoxFuture, BoxStream, MaybeSend, MaybeSync};
+
+/// Chunks whose bounds are looked up at a time.
+const RANGES_AT_ONCE: usize = 8;
 
 /// Names one chunk of a volume.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -213,5 +217,15 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
             }))),
         };
         Box::pin(std::future::ready(found))
+    }
+
+    /// Bounds of several chunks' values in their order, as [`Self::find_value_range`] has each: asked for
+    /// together where asking takes time.
+    fn find_value_ranges<'a>(
+        &'a self,
+        ids: &'a [ChunkId],
+    ) -> BoxFuture<'a, Vec<Result<Option<ValueRange>, ChunkError>>> {
+        let each: Vec<_> = ids.iter().map(|id| self.find_value_range(*id)).collect();
+        Box::pin(stream::iter(each).buffered(RANGES_AT_ONCE).collect())
     }
 }

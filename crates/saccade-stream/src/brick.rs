@@ -41,19 +41,21 @@ pub fn chunks_of(id: BrickId, volume: &Volume) -> impl Iterator<Item = ChunkId> 
     })
 }
 
-/// Bounds of the measured voxels of a brick and its border, if `range` knows those of all its chunks.
+/// Bounds of the measured voxels of a brick and its border, if `range` knows those of all its chunks; of
+/// one in which nothing was acquired, none.
 pub fn range_of(
     id: BrickId,
     volume: &Volume,
-    range: impl Fn(ChunkId) -> Option<ValueRange>,
-) -> Option<ValueRange> {
+    range: impl Fn(ChunkId) -> Option<Option<ValueRange>>,
+) -> Option<Option<ValueRange>> {
     let join = |a: ValueRange, b: ValueRange| ValueRange {
         min: a.min.min(b.min),
         max: a.max.max(b.max),
     };
     let mut ranges = chunks_of(id, volume).map(range);
-    let first = ranges.next()??;
-    ranges.try_fold(first, |all, range| Some(join(all, range?)))
+    ranges.try_fold(None, |all: Option<ValueRange>, range| {
+        Some(all.into_iter().chain(range?).reduce(join))
+    })
 }
 
 /// Assembles bricks one after another in the same memory.

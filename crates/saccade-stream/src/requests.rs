@@ -6,6 +6,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 
 use futures::StreamExt;
 use futures::future::{AbortHandle, Aborted, abortable};
+use saccade_core::volume::Dtype;
 use saccade_source::maybe_send::{MaybeSend, spawn};
 use saccade_source::{Change, Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
 use tokio::sync::Notify;
@@ -22,6 +23,11 @@ pub(crate) enum Event {
         answer: Result<Chunk, ChunkError>,
     },
     Change(Change),
+    /// Bounds of chunks' values; `None` where nothing was acquired.
+    Ranges {
+        number: u64,
+        ranges: Vec<(ChunkId, Option<ValueRange>)>,
+    },
     /// Values of some channels were counted.
     Sample {
         number: u64,
@@ -40,6 +46,9 @@ pub(crate) struct Requests {
     /// Number and handle of the count that is running.
     sample: Option<(u64, AbortHandle)>,
     samples: u64,
+    /// Number and handle of the search for bounds that is running.
+    finding: Option<(u64, AbortHandle)>,
+    searches: u64,
     #[cfg(not(target_family = "wasm"))]
     woken: Arc<Notify>,
 }
@@ -76,6 +85,8 @@ impl Requests {
             changes,
             sample: None,
             samples: 0,
+            finding: None,
+            searches: 0,
             #[cfg(not(target_family = "wasm"))]
             woken,
         }
@@ -108,6 +119,43 @@ impl Requests {
     /// Bounds of a chunk's values, if the source knows them without reading it.
     pub(crate) fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
         self.source.value_range(id)
+    }
+
+    /// Starts to look up the bounds of chunks' values; an earlier search that has not ended is dropped.
+    pub(crate) fn find_ranges(&mut self, ids: Vec<ChunkId>) {
+        let (source, to, wake) = (self.source.clone(), self.sender.clone(), self.wake.clone());
+        self.searches += 1;
+        let number = self.searches;
+        let handle = spawn_abortable(async move {
+            let found = source.find_value_ranges(&ids).await;
+            // Where it failed, everything is possible: who reads the chunk learns why.
+            let any = ValueRange {
+                min: 1,
+                max: match source.volume().dtype {
+                    Dtype::Uint8 => u16::from(u8::MAX),
+                    _ => u16::MAX,
+                },
+            };
+            let found = found.into_iter().map(|range| range.unwrap_or(Some(any)));
+            let ranges = ids.into_iter().zip(found).collect();
+            drop(to.send(Event::Ranges { number, ranges }));
+            wake();
+        });
+        if let Some((_, earlier)) = self.finding.replace((number, handle)) {
+            earlier.abort();
+        }
+    }
+
+    /// Whether bounds are being looked up.
+    pub(crate) fn is_finding(&self) -> bool {
+        self.finding.is_some()
+    }
+
+    /// Bounds that are being looked up may be out of date.
+    pub(crate) fn drop_ranges(&mut self) {
+        if let Some((_, search)) = self.finding.take() {
+            search.abort();
+        }
     }
 
     /// Starts counting values of channels; an earlier count that has not ended is dropped.
@@ -147,6 +195,13 @@ impl Requests {
             Event::Sample { number, .. } => {
                 self.sample.take_if(|(running, _)| running == number);
             }
+            // Of an older search, dropped meanwhile: of the time before a change.
+            Event::Ranges { number, .. } => {
+                let running = self.finding.take_if(|(running, _)| running == number);
+                if running.is_none() {
+                    return self.next();
+                }
+            }
             Event::Change(_) => {}
         }
         Some(event)
@@ -163,6 +218,7 @@ impl Drop for Requests {
         if let Some((_, sample)) = &self.sample {
             sample.abort();
         }
+        self.drop_ranges();
     }
 }
 

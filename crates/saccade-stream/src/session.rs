@@ -1,6 +1,6 @@
 //! A source, a renderer and the pull between them.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,23 +9,28 @@ use glam::UVec2;
 use saccade_core::brick::BrickId;
 use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
 use saccade_render::wgpu::DeviceType;
 use saccade_render::{
     ChannelError, ChannelView, Delivery, Fidelity, FrameReport, Gpu, MemoryUse, Renderer,
     RendererError, RendererOptions, Statistics, View,
 };
-use saccade_source::VolumeSource;
+use saccade_source::{ChunkId, ValueRange, VolumeSource};
 
-use crate::brick::range_of;
+use crate::brick::{chunks_of, range_of};
 use crate::channels::{self, Channel};
 use crate::clock::Clock;
 use crate::histogram::Sample;
+use crate::host_cache::is_touched;
 use crate::policy::{Limits, Pace, Refresh, Retry};
 use crate::pull::{Freshness, Progress, Pull};
 use crate::requests::{Event, Requests};
 
 /// Bricks whose bounds were told, kept in mind; beyond, all are forgotten and told again.
 const MOST_TOLD: usize = 1 << 16;
+
+/// Chunks whose bounds are looked up together.
+const RANGES_TOGETHER: usize = 128;
 
 /// Called, from any thread, when [`Session::frame`] would find something new.
 pub type Wake = Arc<dyn Fn() + Send + Sync>;
@@ -154,6 +159,12 @@ pub struct Session {
     retry: Retry,
     /// Bricks whose bounds the renderer was told since they last changed.
     told: HashSet<BrickId>,
+    /// Bounds of chunks that were looked up since they last changed.
+    ranges: HashMap<ChunkId, Option<ValueRange>>,
+    /// Bricks, and their chunks, whose bounds are being looked up.
+    searched: (HashSet<BrickId>, Vec<ChunkId>),
+    /// Bricks that changed while that was done: they wait no longer.
+    lost: HashSet<BrickId>,
     /// Frames without a report.
     pending: VecDeque<Submitted>,
     drawn: u64,
@@ -221,6 +232,9 @@ impl Session {
             views: Vec::new(),
             frames_in_flight: options.frames_in_flight.max(1),
             told: HashSet::new(),
+            ranges: HashMap::new(),
+            searched: (HashSet::new(), Vec::new()),
+            lost: HashSet::new(),
             pending: VecDeque::new(),
             drawn: 0,
             drawn_view: None,
@@ -403,6 +417,7 @@ impl Session {
     }
 
     fn take_events(&mut self, now: Duration) {
+        let mut changed = false;
         while let Some(event) = self.requests.next() {
             match event {
                 Event::Answer { ticket, answer } => self.pull.answer(ticket, answer, now),
@@ -411,11 +426,24 @@ impl Session {
                     self.pull.change(change.voxels);
                     self.renderer.invalidate(change.voxels);
                     self.told.clear();
+                    self.forget_ranges(change.voxels);
+                    changed = true;
                     self.refresh.changed();
                     self.dirty = true;
                 }
+                Event::Ranges { ranges, .. } => {
+                    if self.ranges.len() > MOST_TOLD {
+                        self.ranges.clear();
+                    }
+                    self.ranges.extend(ranges);
+                    self.searched = (HashSet::new(), Vec::new());
+                    changed = true;
+                }
                 Event::Sample { samples, .. } => self.take_samples(samples),
             }
+        }
+        if changed {
+            self.want_missed();
         }
     }
 
@@ -443,39 +471,83 @@ impl Session {
             self.known_at = Some(now);
             self.frame_size = known.size;
         }
-        let hidden = self.hidden(&report.misses);
-        if hidden.is_empty() {
-            self.pull.want(report.frame, &report.misses);
-        } else {
-            let seen = report.misses.iter().filter(|id| !hidden.contains(id));
-            self.pull
-                .want(report.frame, &seen.copied().collect::<Vec<_>>());
-        }
-        // Without what is hidden, the next frame may be complete.
-        self.dirty |= report.redraw || !hidden.is_empty();
+        self.dirty |= report.redraw;
         self.report = Some(report);
+        self.want_missed();
     }
 
-    /// Of the bricks missed, those that the source knows to hold nothing that can be seen. The
-    /// renderer is told, once: a brick that is missed again is needed.
-    fn hidden(&mut self, misses: &[BrickId]) -> HashSet<BrickId> {
+    /// Forgets the bounds of what changed. What changes again and again is not waited for.
+    fn forget_ranges(&mut self, voxels: VoxelBox) {
+        let volume = self.renderer.volume();
+        let touched = |chunk: &ChunkId| is_touched(*chunk, volume, voxels);
+        self.ranges.retain(|chunk, _| !touched(chunk));
+        if self.searched.1.iter().any(touched) {
+            if self.lost.len() > MOST_TOLD {
+                self.lost.clear();
+            }
+            let (bricks, _) = std::mem::take(&mut self.searched);
+            self.lost.extend(bricks);
+            self.requests.drop_ranges();
+        }
+    }
+
+    /// Wants what the newest report misses, but for what is hidden, or may be as far as is known.
+    fn want_missed(&mut self) {
+        let Some(report) = &self.report else {
+            return;
+        };
+        let (frame, misses) = (report.frame, report.misses.clone());
+        let (hidden, unknown) = self.hidden(&misses);
+        let seen = misses.into_iter();
+        let seen = seen.filter(|id| !hidden.contains(id) && !unknown.contains(id));
+        self.pull.want(frame, &seen.collect::<Vec<_>>());
+        // Without what is hidden, the next frame may be complete.
+        self.dirty |= !hidden.is_empty();
+    }
+
+    /// Of the bricks missed, those that the source knows to hold nothing that can be seen, and those of
+    /// which that is being looked up. The renderer is told of the former, once: a brick that is missed
+    /// again is needed.
+    fn hidden(&mut self, misses: &[BrickId]) -> (HashSet<BrickId>, HashSet<BrickId>) {
         if self.told.len() > MOST_TOLD {
             self.told.clear();
         }
-        let mut hidden = HashSet::new();
+        let volume = self.renderer.volume().clone();
+        let (mut hidden, mut unknown) = (HashSet::new(), HashSet::new());
+        let (mut bricks, mut chunks) = (HashSet::new(), Vec::new());
+        let mut seen = HashSet::new();
         for &id in misses {
-            if !self.told.insert(id) {
+            if self.told.contains(&id) {
                 continue;
             }
-            let volume = self.renderer.volume().clone();
-            let range = range_of(id, &volume, |chunk| self.requests.value_range(chunk));
-            if let Some(range) = range
+            let (ranges, requests) = (&self.ranges, &self.requests);
+            let known = |chunk| {
+                let at_hand = || requests.value_range(chunk).map(Some);
+                ranges.get(&chunk).copied().or_else(at_hand)
+            };
+            let range = range_of(id, &volume, known);
+            let lost = self.lost.contains(&id);
+            if range.is_none() && !lost && self.renderer.may_hide(id.channel()) {
+                if chunks.len() < RANGES_TOGETHER {
+                    let new = chunks_of(id, &volume).filter(|chunk| known(*chunk).is_none());
+                    chunks.extend(new.filter(|chunk| seen.insert(*chunk)));
+                    bricks.insert(id);
+                }
+                unknown.insert(id);
+                continue;
+            }
+            self.told.insert(id);
+            if let Some(range) = range.flatten()
                 && self.renderer.note_range(id, [range.min, range.max])
             {
                 hidden.insert(id);
             }
         }
-        hidden
+        if !chunks.is_empty() && !self.requests.is_finding() {
+            self.requests.find_ranges(chunks.clone());
+            self.searched = (bricks, chunks);
+        }
+        (hidden, unknown)
     }
 
     /// Hands ready bricks to the renderer; whether there may be more.
@@ -500,7 +572,8 @@ impl Session {
         let progress = self.pull.progress();
         let report = self.report.as_ref();
         let known = self.pending.is_empty() && !self.dirty;
-        let idle = progress.wanted == 0 && !self.requests.is_sampling();
+        let searching = self.requests.is_sampling() || self.requests.is_finding();
+        let idle = progress.wanted == 0 && !searching;
         // While frames are being drawn, their end is awaited before the next.
         let draws_at = draws_at.filter(|_| self.pending.is_empty());
         let due = [progress.retry_at, self.refresh.due(), draws_at];

@@ -276,7 +276,7 @@ async fn who_waited_in_vain_learns_what_failed() {
     let broken = Arc::new(Unreliable::new(|_, id| Err(failed(id, true))));
     let view = view(&*broken);
     let mut session = Session::new(&gpu, broken, options()).unwrap();
-    let waited = Duration::from_millis(500);
+    let waited = Duration::from_secs(2);
     let error = session.settle(&view, waited).await.unwrap_err();
     assert!(matches!(error, SettleError::Timeout { .. }), "{error}");
     assert!(error.to_string().contains("unplugged"), "{error}");
@@ -300,11 +300,20 @@ async fn the_users_transfer_function_stays() {
     assert!(picture(&mut session, &view).await == automatic);
 }
 
-/// Counts reads, and tells values of chunks without one, or keeps them to itself.
+/// When a source tells values of chunks that were not read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Tells {
+    AtOnce,
+    WhenAsked,
+    Never,
+}
+
+/// Counts reads, and questions for bounds.
 struct Ranged {
     inner: ArraySource,
     reads: AtomicU64,
-    tells: bool,
+    questions: AtomicU64,
+    tells: Tells,
 }
 
 impl VolumeSource for Ranged {
@@ -322,7 +331,23 @@ impl VolumeSource for Ranged {
     }
 
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
-        self.tells.then(|| self.inner.value_range(id))?
+        (self.tells == Tells::AtOnce).then(|| self.inner.value_range(id))?
+    }
+
+    fn find_value_ranges<'a>(
+        &'a self,
+        ids: &'a [ChunkId],
+    ) -> BoxFuture<'a, Vec<Result<Option<ValueRange>, ChunkError>>> {
+        self.questions.fetch_add(1, Ordering::Relaxed);
+        Box::pin(async move {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+            let any = ValueRange { min: 1, max: 255 };
+            let found = ids.iter().map(|id| match self.tells {
+                Tells::Never => Ok(Some(any)),
+                _ => Ok(self.inner.value_range(*id)),
+            });
+            found.collect()
+        })
     }
 }
 
@@ -352,10 +377,11 @@ async fn what_a_source_knows_to_be_hidden_is_not_read() {
         opacity_length_nm: 20.0,
     };
     let mut seen = Vec::new();
-    for tells in [true, false] {
+    for tells in [Tells::AtOnce, Tells::Never, Tells::WhenAsked] {
         let source = Arc::new(Ranged {
             inner: ArraySource::new(volume.clone(), voxels.clone()).unwrap(),
             reads: AtomicU64::new(0),
+            questions: AtomicU64::new(0),
             tells,
         });
         let view = View {
@@ -365,11 +391,18 @@ async fn what_a_source_knows_to_be_hidden_is_not_read() {
         let mut session = Session::new(&gpu, source.clone(), options()).unwrap();
         session.set_transfer_function(0, transfer.clone()).unwrap();
         let image = picture(&mut session, &view).await;
-        seen.push((image, source.reads.load(Ordering::Relaxed)));
+        let [reads, questions] =
+            [&source.reads, &source.questions].map(|n| n.load(Ordering::Relaxed));
+        let chunks = volume.chunks(0).element_product();
+        assert!(questions <= 8, "{questions} questions for {chunks} chunks");
+        assert_eq!(questions > 0, tells != Tells::AtOnce);
+        seen.push((image, reads));
     }
-    let [(with, few), (without, many)] = &seen[..] else {
+    let [(with, few), (without, many), (asked, of_asked)] = &seen[..] else {
         unreachable!()
     };
+    assert!(asked == with, "asked for or known, it is the same");
+    assert_eq!(of_asked, few, "what is hidden is not read");
     assert!(
         with.rgba.chunks_exact(4).any(|p| p[0] > 50),
         "something is seen"
