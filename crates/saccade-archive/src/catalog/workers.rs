@@ -37,6 +37,9 @@ pub struct Claim {
     pub parked: bool,
 }
 
+/// Number of the lock under which records of volume 0 are claimed; other programs use others.
+const CLAIMING: i64 = 0x5361_6363_0000_0000;
+
 impl Catalog {
     /// A new worker. It has to give a sign of life, by [`Self::claim`] or [`Self::keep_alive`], before
     /// `lease` is over, else what it claimed is free again.
@@ -94,6 +97,16 @@ impl Catalog {
     ) -> Result<Vec<Claim>, CatalogError> {
         let volume = self.volume_id(volume).await?;
         let mut transaction = self.transaction(Durability::Soon).await?;
+        // One at a time, and each with a view of what those before it did. Without that, a record that another
+        // claims during the statement is looked at again beside workers as they were when it began:
+        // one that registered since counts as dead.
+        let take_turns = Statement {
+            sqlite: "SELECT $1",
+            postgres: "SELECT pg_advisory_xact_lock($1)",
+        };
+        let turn = [(CLAIMING + volume).into()];
+        let taken = transaction.run(take_turns, &turn).await;
+        taken.map_err(|e| self.failed(e))?;
         let now = self.renew(&mut transaction, worker).await?;
         let claim = Statement {
             sqlite: "WITH free AS MATERIALIZED ( \
@@ -105,7 +118,7 @@ impl Catalog {
                      UPDATE waiting SET worker = $2, attempts = attempts + 1 \
                      WHERE volume = $1 AND position IN (SELECT position FROM free) \
                      RETURNING position, record, reason, attempts, parked",
-            // What another is claiming right now is passed over rather than waited for.
+            // A record that is being given back or done right now is passed over rather than waited for.
             postgres: "WITH free AS MATERIALIZED ( \
                          SELECT w.position FROM waiting w WHERE w.volume = $1 \
                            AND NOT EXISTS (SELECT 1 FROM workers k WHERE k.id = w.worker AND k.lease >= $3) \
