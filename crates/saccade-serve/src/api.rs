@@ -162,6 +162,7 @@ impl From<Change> for ChangeDocument {
         crate::routes::status,
         crate::routes::changes,
         crate::routes::picture,
+        crate::routes::ranges,
     ),
     components(schemas(ChangeDocument))
 )]

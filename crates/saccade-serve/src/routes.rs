@@ -351,6 +351,21 @@ const MOST_RANGES: usize = 256;
 ///
 /// Of the channel and level, chunks as x,y,z with semicolons between them, 256 at most. 400 where there are no
 /// such chunks, or too many.
+#[utoipa::path(
+    get,
+    path = "/v/{name}/ranges/{channel}/{level}/{chunks}",
+    params(
+        ("name" = String, Path, description = "name of the volume"),
+        ("channel" = u32, Path, description = "channel, from 0"),
+        ("level" = u32, Path, description = "level, 0 the finest"),
+        ("chunks" = String, Path, description = "x,y,z of chunks, with semicolons between them, 256 at most")
+    ),
+    responses(
+        (status = 200, body = RangeList),
+        (status = 400, body = Refusal, description = "the volume has not all of these chunks, or they are too many"),
+        (status = 404, body = Refusal, description = "no such volume")
+    )
+)]
 pub(crate) async fn ranges(
     State(app): State<App>,
     Path((name, channel, level, chunks)): Path<(String, u32, u32, String)>,

@@ -93,16 +93,20 @@ fn answers_are_what_the_document_says() {
             described,
             [
                 "/v/{name}/events",
+                "/v/{name}/ranges/{channel}/{level}/{chunks}",
                 "/v/{name}/status.json",
                 "/v/{name}/thumbnail.png",
                 "/v/{name}/volume.json",
                 "/volumes.json"
             ]
         );
+        let filled = |path: &str, name: &str| {
+            let path = path.replace("{name}", name);
+            let path = path.replace("{channel}/{level}/{chunks}", "0/1/0,0,0;0,0,0");
+            path.trim_start_matches('/').to_owned()
+        };
         for path in described {
-            let response = served
-                .get(path.replace("{name}", "em").trim_start_matches('/'))
-                .await;
+            let response = served.get(&filled(path, "em")).await;
             assert_eq!(response.status(), StatusCode::OK, "{path}");
             let media = header(response.headers(), "content-type")
                 .unwrap()
@@ -125,9 +129,7 @@ fn answers_are_what_the_document_says() {
                 );
             }
             if path.contains("{name}") {
-                let refused = served
-                    .get(path.replace("{name}", "x").trim_start_matches('/'))
-                    .await;
+                let refused = served.get(&filled(path, "x")).await;
                 assert_eq!(refused.status(), StatusCode::NOT_FOUND, "{path}");
                 let refusal = serde_json::from_slice(&refused.bytes().await.unwrap()).unwrap();
                 let schema = schema(&document, path, "404", "application/json");

@@ -51,18 +51,20 @@ pub(crate) struct Ingest {
 pub(crate) struct Bare {
     /// The folder holds no records: its file names are like this, such as
     /// 's{section}/r{row}_c{column}_{channel}.tif'; {channel} and folders as needed, {} is anything
+    /// [default: tiles.jsonl names the files]
     #[arg(long, value_name = "PATTERN", requires_all = ["extent", "voxel", "pitch"])]
     pattern: Option<Pattern>,
 
-    /// Size of the volume [voxels]
+    /// Size of the volume [voxels], with --pattern [default: as volume.json says]
     #[arg(long, value_name = "X,Y,Z", value_parser = extent, requires = "pattern")]
     extent: Option<UVec3>,
 
-    /// Voxel size [nm]
+    /// Voxel size [nm], with --pattern [default: as volume.json says]
     #[arg(long, value_name = "X,Y,Z", value_parser = voxel_nm, requires = "pattern")]
     voxel: Option<DVec3>,
 
-    /// From a tile's corner to the next column's and the next row's [voxels]
+    /// From a tile's corner to the next column's and the next row's [voxels], with --pattern [default: as
+    /// tiles.jsonl says]
     #[arg(long, value_name = "X,Y", value_parser = pitch, requires = "pattern")]
     pitch: Option<DVec2>,
 
