@@ -71,10 +71,12 @@ pub(crate) struct Render {
     iso: Option<f32>,
 
     /// Show a part only: two opposite corners [voxels of the finest level]
+    /// [default: all of it]
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", value_parser = box_from_text, allow_hyphen_values = true)]
     clip: Option<[DVec3; 2]>,
 
-    /// Show one plane, as in z=40 [voxels of the finest level]
+    /// Show one plane, as in z=40 [voxels of the finest level] [default: all
+    /// depths]
     #[arg(long, value_name = "AXIS=VOXEL", value_parser = slice_from_text)]
     slice: Option<Slice>,
 
