@@ -190,7 +190,13 @@ fn say(text: &str) {
 async fn end_in_peace(scope: &Scope, place: &Place, late: &[u8], said: u64) {
     fs::write(scope.file("late"), late).unwrap();
     let resumed = place.open().await;
-    scope.ingest(&resumed).await;
+    // After so many deaths a record that was in hand at several of them is no poison.
+    let patient = IngestOptions {
+        attempts: u32::MAX,
+        ..quick()
+    };
+    let done = run(&place.acquisition, &resumed, &patient, &(), &Cancel::new()).await;
+    done.unwrap();
     assert_eq!(resumed.catalog().cursor(VOLUME).await.unwrap().line, said);
     assert_eq!(resumed.catalog().queued(VOLUME).await.unwrap(), (0, 0));
 
