@@ -208,7 +208,8 @@ fn name(folder: &Path) -> String {
     }
 }
 
-/// Voxels of a chunk of `size` that lie inside of the volume, from its corner: the rest is 0.
+/// A chunk of `size` voxels of some `bytes`, all 0, with its width and height \[voxels\]; `inside` is the part
+/// that lies in the volume.
 fn padded(size: UVec3, inside: VoxelBox, bytes: usize) -> (Vec<u8>, usize, usize) {
     let [width, height, depth] = size.to_array().map(|edge| edge as usize);
     debug_assert!(inside.size().cmple(size).all(), "a part of the chunk");
