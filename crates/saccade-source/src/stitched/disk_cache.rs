@@ -18,7 +18,7 @@ use std::fs::File;
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
 
 use bytes::{BufMut, Bytes, BytesMut};
 use foyer::{
@@ -62,8 +62,8 @@ pub struct DiskCache(Arc<Inner>);
 
 struct Inner {
     blocks: HybridCache<u64, Bytes>,
-    /// Locked while the folder is in use.
-    _lock: File,
+    /// Locked while the folder is in use; `None` once closed.
+    lock: RwLock<Option<File>>,
 }
 
 impl fmt::Debug for DiskCache {
@@ -120,19 +120,36 @@ impl DiskCache {
             .map_err(|e| failed(e.into()))?;
         Ok(Self(Arc::new(Inner {
             blocks,
-            _lock: lock,
+            lock: RwLock::new(Some(lock)),
         })))
     }
 
-    /// Writes what waits to be written, and ends.
+    /// Writes what waits to be written, and leaves the folder to others. Clones that are still held, by
+    /// work that nobody waits for any more, find and keep nothing from here on.
     pub async fn close(&self) {
+        let lock = { self.0.lock.write() }
+            .unwrap_or_else(PoisonError::into_inner)
+            .take();
+        let Some(lock) = lock else { return };
         if let Err(error) = self.0.blocks.close().await {
             log::warn!("the cache on disk was not closed: {error}");
         }
+        // Not only dropped: a child process that is being started has a copy for a moment.
+        if let Err(error) = lock.unlock() {
+            log::warn!("the folder of the cache on disk was not freed: {error}");
+        }
+    }
+
+    /// Whether the folder is still this cache's.
+    fn open_still(&self) -> RwLockReadGuard<'_, Option<File>> {
+        self.0.lock.read().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The block that was built from a plan of this description.
     pub(super) async fn get(&self, description: &[u8]) -> Option<Block> {
+        if self.open_still().is_none() {
+            return None;
+        }
         let loaded = self.0.blocks.storage().load(&key(description)).await;
         let kept = match loaded {
             Ok(Load::Entry { value, .. }) => value,
@@ -158,8 +175,12 @@ impl DiskCache {
         kept.put_u64_le(description.len() as u64);
         kept.put_slice(description);
         kept.put_slice(&bytes);
-        let writer = self.0.blocks.storage_writer(key(description)).force();
-        writer.insert(kept.freeze());
+        // Held over the insertion, so that closing begins before it or waits for what it wrote.
+        let open = self.open_still();
+        if open.is_some() {
+            let writer = self.0.blocks.storage_writer(key(description)).force();
+            writer.insert(kept.freeze());
+        }
     }
 }
 

@@ -156,6 +156,8 @@ fn folders_that_cannot_be_used_are_told() {
             matches!(taken, Err(DiskCacheError::Taken { .. })),
             "{taken:?}"
         );
+        // A clone that somebody still holds does not keep the folder.
+        let held = cache.clone();
         cache.close().await;
         drop(cache);
         // A smaller one leaves no files of the larger one behind.
@@ -163,6 +165,13 @@ fn folders_that_cannot_be_used_are_told() {
         let many = files();
         let cache = DiskCache::open(folder.path(), 0).await.unwrap();
         assert_eq!((many, files()), (16 + 1, 4 + 1));
+        held.close().await;
+        drop(held);
+        let taken = DiskCache::open(folder.path(), 0).await;
+        assert!(
+            matches!(taken, Err(DiskCacheError::Taken { .. })),
+            "{taken:?}"
+        );
         drop(cache);
         let file = folder.path().join("lock");
         let open = DiskCache::open(&file, 0).await;
