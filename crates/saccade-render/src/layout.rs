@@ -51,7 +51,7 @@ pub(crate) const COUNT_MISSES: u32 = 0;
 pub(crate) const COUNT_STALE: u32 = 1;
 /// Samples taken.
 pub(crate) const COUNT_SAMPLES: u32 = 2;
-/// Page table walks.
+/// Entries read of the page directory and of page tables \[000 fig. 6\].
 pub(crate) const COUNT_LOOKUPS: u32 = 3;
 /// Segments drawn from another level than wanted.
 pub(crate) const COUNT_SUBSTITUTED: u32 = 4;
@@ -65,9 +65,9 @@ pub(crate) const COUNT_NODES: u32 = 7;
 
 /// Rays that met the volume.
 pub(crate) const COUNT_RAYS: u32 = 8;
-/// Page table walks of the ray that had the most.
+/// Entries read by the ray that read the most.
 pub(crate) const MOST_LOOKUPS: u32 = 9;
-/// `u32::MAX` less the page table walks of the ray that had the fewest.
+/// `u32::MAX` less the entries read by the ray that read the fewest.
 pub(crate) const FEWEST_LOOKUPS: u32 = 10;
 
 /// Depths that a residency octree can have, its root's included.

@@ -59,9 +59,9 @@ pub struct Statistics {
     pub samples: u32,
     /// Rays that met the volume.
     pub rays: u32,
-    /// Page table walks.
+    /// Entries read of the page directory and of page tables \[000 fig. 6\].
     pub lookups: u32,
-    /// Page table walks of the ray, of those that met the volume, that had the fewest, and the most.
+    /// Entries read by the ray, of those that met the volume, that read the fewest, and the most.
     pub lookups_per_ray: [u32; 2],
     /// Nodes of the residency octree visited.
     pub nodes: u32,

@@ -29,7 +29,7 @@ pub struct Heat {
 /// Work of a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Work {
-    /// Page table walks.
+    /// Entries read of the page directory and of page tables \[000 fig. 6\].
     Lookups,
     /// Nodes of the residency octree visited.
     Nodes,

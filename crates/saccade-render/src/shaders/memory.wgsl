@@ -27,6 +27,7 @@ struct LeafBlock {
 // The one used last, per channel: most bricks along a ray share it.
 var<private> last: array<LeafBlock, SLOTS>;
 
+// Entries read, of the directory and of page tables.
 var<private> lookups: u32;
 var<private> misses_left: u32 = max(MISSES_PER_RAY, MISSES_PER_CHANNEL * SLOTS);
 
@@ -75,6 +76,7 @@ fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
 }
 
 fn find(channel: u32, level: u32, brick: vec3u) -> Found {
+    // One entry is read in any case: the last one of the way, or the first.
     lookups += 1u;
     let edge = frame.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
@@ -103,6 +105,7 @@ fn find(channel: u32, level: u32, brick: vec3u) -> Found {
         let entry = first + ((((at.z << edge) + at.y) << edge) + at.x);
         physical = frame.directory_entries + entry;
         value = tables[entry];
+        lookups += 1u;
         if span == 0u {
             last[channel] = LeafBlock(block_at, level + 1u, first);
         }
