@@ -1,5 +1,6 @@
 //! The rows, in groups that are measured together.
 
+mod codec;
 mod construct;
 mod first_light;
 mod index;
@@ -36,6 +37,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: ingest::SIMULATE_IDS,
         measure: ingest::simulate,
+    },
+    Group {
+        ids: codec::IDS,
+        measure: codec::measure,
     },
     Group {
         ids: construct::IDS,

@@ -56,6 +56,13 @@ fn noisy(value: u8, random: &mut u64) -> u8 {
     u8::try_from(noisy.clamp(1, 255)).unwrap_or(u8::MAX)
 }
 
+/// Writes a square image as an uncompressed TIFF.
+pub(crate) fn write_image(path: &Path, edge: u32, pixels: &[u8]) -> Result<()> {
+    let out = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+    TiffEncoder::new(BufWriter::new(out))?.write_image::<Gray8>(edge, edge, pixels)?;
+    Ok(())
+}
+
 /// The microscope's side of an acquisition archive.
 pub(crate) struct Microscope {
     folder: PathBuf,
@@ -74,11 +81,7 @@ impl Microscope {
 
     /// Writes an image; nobody knows of it before [`Self::announce`].
     pub(crate) fn write_image(&self, tile: &str, edge: u32, pixels: &[u8]) -> Result<()> {
-        let path = self.folder.join(file(tile));
-        let out =
-            File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
-        TiffEncoder::new(BufWriter::new(out))?.write_image::<Gray8>(edge, edge, pixels)?;
-        Ok(())
+        write_image(&self.folder.join(file(tile)), edge, pixels)
     }
 
     /// Appends the record of a tile: from here on it has arrived.
