@@ -194,10 +194,38 @@ pub(crate) struct TransferStorage {
     pub(crate) pad_0: u32,
 }
 
-/// The ray-caster's source for up to `slots` channels and a mode, one of `MODE_`.
+/// What a shader is made for: constants, so that compilers leave out what is not needed.
 ///
-/// Both are constants, so that compilers leave out what is not needed.
-pub(crate) fn ray_cast(slots: u32, mode: u32) -> String {
+/// Drivers that draw on the CPU run both sides of every `if` on numbers, with what does not count masked out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct Variant {
+    /// Channels it can draw.
+    pub(crate) slots: u32,
+    /// One of `MODE_`.
+    pub(crate) mode: u32,
+    /// Whether voxels are two parts that are joined before they are interpolated.
+    pub(crate) joined: bool,
+}
+
+impl Variant {
+    /// For so many channels: variants are few, so that showing one channel more rarely compiles.
+    pub(crate) fn new(channels: usize, mode: u32, joined: bool) -> Self {
+        let channels = u32::try_from(channels).expect("a few channels");
+        Self {
+            slots: channels.max(1).next_power_of_two(),
+            mode,
+            joined,
+        }
+    }
+}
+
+/// The ray-caster's source.
+pub(crate) fn ray_cast(variant: Variant) -> String {
+    let Variant {
+        slots,
+        mode,
+        joined,
+    } = variant;
     // With one channel there is nothing to count.
     let count = if slots == 1 {
         "1u"
@@ -205,7 +233,7 @@ pub(crate) fn ray_cast(slots: u32, mode: u32) -> String {
         "frame.channel_count"
     };
     format!(
-        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\n\
+        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\n\
          fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}"
     )
 }
@@ -228,12 +256,12 @@ mod tests {
     use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE};
     use std::mem::{offset_of, size_of};
 
-    const VARIANTS: [(u32, u32); 5] = [
-        (1, MODE_EMISSION_ABSORPTION),
-        (1, MODE_MAXIMUM),
-        (1, MODE_ISO_SURFACE),
-        (2, MODE_EMISSION_ABSORPTION),
-        (16, MODE_ISO_SURFACE),
+    const VARIANTS: [(usize, u32, bool); 5] = [
+        (1, MODE_EMISSION_ABSORPTION, false),
+        (1, MODE_MAXIMUM, true),
+        (1, MODE_ISO_SURFACE, false),
+        (2, MODE_EMISSION_ABSORPTION, true),
+        (16, MODE_ISO_SURFACE, false),
     ];
 
     fn parsed(source: &str) -> naga::Module {
@@ -242,17 +270,17 @@ mod tests {
     }
 
     fn module() -> naga::Module {
-        parsed(&ray_cast(1, MODE_EMISSION_ABSORPTION))
+        parsed(&ray_cast(Variant::new(1, MODE_EMISSION_ABSORPTION, false)))
     }
 
     #[test]
     fn every_shader_is_valid_without_any_optional_feature() {
-        for (slots, mode) in VARIANTS {
+        for (channels, mode, joined) in VARIANTS {
             let mut validator = naga::valid::Validator::new(
                 naga::valid::ValidationFlags::all(),
                 naga::valid::Capabilities::empty(),
             );
-            let source = ray_cast(slots, mode);
+            let source = ray_cast(Variant::new(channels, mode, joined));
             let module = parsed(&source);
             validator
                 .validate(&module)

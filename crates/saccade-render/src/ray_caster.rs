@@ -3,30 +3,10 @@
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 
-use crate::layout::{FrameUniform, ray_cast};
+use crate::layout::{FrameUniform, Variant, ray_cast};
 
 /// Format of the picture: portable for storage, read as it is by windows.
 pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
-
-/// What a pipeline is made for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(crate) struct Variant {
-    /// Channels it can draw.
-    slots: u32,
-    /// One of `layout::MODE_`.
-    mode: u32,
-}
-
-impl Variant {
-    /// The variant for so many channels: they are few, so that showing one channel more rarely compiles.
-    pub(crate) fn new(channels: usize, mode: u32) -> Self {
-        let channels = u32::try_from(channels).expect("a few channels");
-        Self {
-            slots: channels.max(1).next_power_of_two(),
-            mode,
-        }
-    }
-}
 
 /// The pipelines and the order of their bindings.
 #[derive(Debug)]
@@ -110,7 +90,7 @@ fn pipeline(
 ) -> wgpu::ComputePipeline {
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
         label: Some("ray-caster"),
-        source: wgpu::ShaderSource::Wgsl(ray_cast(variant.slots, variant.mode).into()),
+        source: wgpu::ShaderSource::Wgsl(ray_cast(variant).into()),
     });
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some("ray-caster"),

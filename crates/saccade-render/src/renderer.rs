@@ -15,13 +15,12 @@ use crate::delivery::{BrickVoxels, Delivery, DeliveryError, Freshness};
 use crate::frame::{Scene, Seen, frame_uniform, mode_of};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
-use crate::layout::{MOST_CHANNELS, NODE_CHANNEL, NODE_CHANNEL_WORDS};
+use crate::layout::{MOST_CHANNELS, NODE_CHANNEL, NODE_CHANNEL_WORDS, Variant};
 use crate::memory::plan::{DeviceLimits, Misfit, Needs, OctreeSize, Plan, READBACKS};
 use crate::memory::pressure::Pressure;
 use crate::memory::{Frame, Placement, VirtualMemory, Want};
 use crate::octree::{BrickValues, Geometry, ResidencyOctree, Values, default_cell};
 use crate::options::{RendererError, RendererOptions, Traversal};
-use crate::ray_caster::Variant;
 use crate::readback::{self, Staging};
 use crate::report::{FrameReport, MemoryUse, RawReport};
 use crate::resources::{Picture, Resources};
@@ -84,6 +83,11 @@ impl BrickFormat {
             _ => (wgpu::TextureFormat::R8Unorm, Vec2::X),
         };
         Self { texture, combine }
+    }
+
+    /// Whether a texel has two parts.
+    fn is_joined(self) -> bool {
+        self.combine.y > 0.0
     }
 }
 
@@ -317,7 +321,11 @@ impl Renderer {
             .iter()
             .map(|(view, table)| Seen { view, table });
         let uniform = frame_uniform(&view, lod_bias, scene, &seen.collect::<Vec<_>>());
-        let variant = Variant::new(self.channels.len(), mode_of(self.mode));
+        let variant = Variant::new(
+            self.channels.len(),
+            mode_of(self.mode),
+            self.format.is_joined(),
+        );
         let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());
         let target = readback.as_ref().map(|r| r.staging.buffer());
         let bands = self.options.bands;

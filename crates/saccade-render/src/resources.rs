@@ -4,10 +4,10 @@ use glam::{UVec2, UVec3};
 use saccade_core::brick::BRICK_STORED_EDGE;
 
 use crate::gpu::Gpu;
-use crate::layout::{FrameUniform, MOST_CHANNELS, TransferStorage, WORKGROUP};
+use crate::layout::{FrameUniform, MOST_CHANNELS, TransferStorage, Variant, WORKGROUP};
 use crate::memory::plan::Plan;
 use crate::memory::{Array, Entry};
-use crate::ray_caster::{IMAGE_FORMAT, Variant};
+use crate::ray_caster::IMAGE_FORMAT;
 use crate::stored_brick::StoredBrick;
 
 /// Caches and buffers of one volume.

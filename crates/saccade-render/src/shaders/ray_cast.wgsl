@@ -216,7 +216,7 @@ fn aim(channel: u32, depth: f32, ray: vec3f) {
 // The stored value at a place in a channel's brick [voxels from its low corner], from 0 to 1.
 fn stored_at(channel: u32, in_brick: vec3f) -> f32 {
     let at = low_texel[channel] + in_brick;
-    if frame.combine.y > 0.0 {
+    if JOINED {
         return stored_of_parts(at);
     }
     let texel = 1.0 / vec3f(frame.brick_grid * BRICK_STORED_EDGE);
