@@ -230,7 +230,7 @@ pub(crate) fn ray_cast(variant: Variant) -> String {
     let count = if slots == 1 {
         "1u"
     } else {
-        "frame.channel_count"
+        "frame.channel_count | nothing"
     };
     format!(
         "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\n\

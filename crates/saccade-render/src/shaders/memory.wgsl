@@ -9,6 +9,22 @@
 // Counters; a bit per brick slot, then per page table block, in use; (entry, urgency) of misses.
 @group(0) @binding(5) var<storage, read_write> report: array<atomic<u32>>;
 
+// 0, which compilers cannot know. Mesa's drivers compile a shader anew, before each frame, for the values of uniforms that
+// alone decide an `if` or end a loop; what is combined with this does not.
+var<private> nothing: u32;
+
+fn has_flag(flag: u32) -> bool {
+    return ((frame.flags | nothing) & flag) != 0u;
+}
+
+fn channel_has(channel: u32, flag: u32) -> bool {
+    return ((frame.channels[channel].flags | nothing) & flag) != 0u;
+}
+
+fn level_count() -> u32 {
+    return frame.level_count | nothing;
+}
+
 // Where the way to a brick ended.
 struct Found {
     entry: u32,     // without its stale bit
@@ -21,13 +37,12 @@ struct Found {
 struct LeafBlock {
     at: vec3u,
     level: u32, // one more than the level; 0 is none
-    first: u32, // first entry
+    block: u32, // the entry that leads to it
 }
 
 // The one used last, per channel: most bricks along a ray share it.
 var<private> last: array<LeafBlock, SLOTS>;
 
-// Entries read, of the directory and of page tables.
 var<private> lookups: u32;
 var<private> misses_left: u32 = max(MISSES_PER_RAY, MISSES_PER_CHANNEL * SLOTS);
 
@@ -76,39 +91,39 @@ fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
 }
 
 fn find(channel: u32, level: u32, brick: vec3u) -> Found {
-    // One entry is read in any case: the last one of the way, or the first.
     lookups += 1u;
     let edge = frame.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
     let block_at = brick >> vec3u(edge);
-    if level + 1u == last[channel].level && all(block_at == last[channel].at) {
-        let at = brick & inside;
-        let entry = last[channel].first + ((((at.z << edge) + at.y) << edge) + at.x);
-        return found_at(tables[entry], frame.directory_entries + entry, 0u);
+    let is_last = level + 1u == last[channel].level && all(block_at == last[channel].at);
+    var span = edge;
+    var value = last[channel].block;
+    var physical = 0u;
+    if !is_last {
+        span = edge * (frame.depth - 1u);
+        let size = frame.levels[level].directory;
+        let cell = brick >> vec3u(span);
+        let base = frame.channels[channel].directory_offset + frame.levels[level].directory_base;
+        physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
+        value = directory[physical];
     }
-    var span = edge * (frame.depth - 1u);
-    let size = frame.levels[level].directory;
-    let cell = brick >> vec3u(span);
-    let base = frame.channels[channel].directory_offset + frame.levels[level].directory_base;
-    var physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
-    var value = directory[physical];
     loop {
         let slot = value & ~STALE;
         if span == 0u || slot < FIRST_SLOT {
             break;
         }
+        if span == edge {
+            last[channel] = LeafBlock(block_at, level + 1u, value);
+        }
         let block = slot - FIRST_SLOT;
-        mark_block_used(block);
+        if !is_last {
+            mark_block_used(block);
+        }
         span -= edge;
         let at = (brick >> vec3u(span)) & inside;
-        let first = block << (3u * edge);
-        let entry = first + ((((at.z << edge) + at.y) << edge) + at.x);
+        let entry = (block << (3u * edge)) + ((((at.z << edge) + at.y) << edge) + at.x);
         physical = frame.directory_entries + entry;
         value = tables[entry];
-        lookups += 1u;
-        if span == 0u {
-            last[channel] = LeafBlock(block_at, level + 1u, first);
-        }
     }
     return found_at(value, physical, span);
 }

@@ -106,12 +106,15 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
     var hidden = 0u;
     var settled = 0u;
     var alike = 0u;
-    if !is_new {
-        hidden = path_hidden[at];
-        settled = path_settled[at];
-    } else if at > 0u {
-        hidden = path_hidden[at - 1u];
-        settled = path_settled[at - 1u];
+    // With one channel, a node in which it is hidden or settled ends the walk: those above know nothing.
+    if SLOTS > 1u {
+        if !is_new {
+            hidden = path_hidden[at];
+            settled = path_settled[at];
+        } else if at > 0u {
+            hidden = path_hidden[at - 1u];
+            settled = path_settled[at - 1u];
+        }
     }
     loop {
         let first = node * frame.octree.node_words;
@@ -123,7 +126,7 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
                 if (hidden & bit) != 0u {
                     continue;
                 }
-                if (frame.channels[c].flags & CHANNEL_VALUES) == 0u {
+                if !channel_has(c, CHANNEL_VALUES) {
                     settled |= bit;
                     continue;
                 }
@@ -147,8 +150,10 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
                     settled |= bit;
                 }
             }
-            path_hidden[at] = hidden;
-            path_settled[at] = settled;
+            if SLOTS > 1u {
+                path_hidden[at] = hidden;
+                path_settled[at] = settled;
+            }
             if (hidden | settled) == everything {
                 break;
             }

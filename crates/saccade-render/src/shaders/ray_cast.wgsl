@@ -3,6 +3,9 @@
 // A ray is cut into segments of half a voxel of the finest level drawn at their start, measured along the
 // ray; each is sampled once. The residency octree tells which can be skipped; other bricks are
 // looked up one by one, and all segments in one are sampled without further lookups. See the crate's documentation for the rules an image follows.
+//
+// Rays drawn at once wait for each other, and drivers that draw on the CPU run both sides of every
+// `if`. So what few need stands in an outer loop, and what all need in an inner one.
 
 @group(0) @binding(7) var bricks: texture_3d<f32>;
 @group(0) @binding(8) var bricks_sampler: sampler;
@@ -57,12 +60,10 @@ fn is_transparent(channel: u32, slot: u32) -> bool {
 
 // Linear RGB and extinction of a stored value. Nothing acquired is nothing seen.
 fn color_of(channel: u32, stored: f32) -> vec4f {
-    if stored <= 0.0 {
-        return vec4f(0.0);
-    }
     let x = table_position(channel, stored * frame.largest);
     let i = min(u32(x), TABLE_LEN - 2u);
-    return mix(transfer[channel].colors[i], transfer[channel].colors[i + 1u], x - f32(i));
+    let color = mix(transfer[channel].colors[i], transfer[channel].colors[i + 1u], x - f32(i));
+    return select(vec4f(0.0), color, stored > 0.0);
 }
 
 // What is drawn for a stretch of the ray.
@@ -79,75 +80,15 @@ fn source(channel: u32, level: u32, depth: f32, ray: vec3f) -> Source {
     return Source(level, found, place, leaving(level, place, found.span_log2, ray));
 }
 
-fn is_known(found: Found) -> bool {
-    return found.entry >= EMPTY;
-}
-
-// Empty space known to be empty in coarser levels too is skipped in one step.
-fn widened(channel: u32, empty: Source, depth: f32, ray: vec3f) -> Source {
-    var wide = empty;
-    for (var level = empty.level + 1u; level < frame.level_count; level += 1u) {
-        let coarser = source(channel, level, depth, ray);
-        if coarser.found.entry != EMPTY || coarser.found.stale {
-            break;
-        }
-        wide.leaving = max(wide.leaving, coarser.leaving);
-    }
-    return wide;
-}
-
 // Bits below one.
 fn bits_below(bit: u32) -> u32 {
     return select((1u << bit) - 1u, 0xffffffffu, bit >= 32u);
 }
 
-// The nearest level that is there, coarser ones first [001 alg. 7.2].
-fn substitute(channel: u32, wanted: Source, depth: f32, ray: vec3f, urgency: f32) -> Source {
-    var there = 0xffffffffu;
-    if (frame.channels[channel].flags & CHANNEL_RESIDENCY) != 0u {
-        there = levels_around(channel, cell_at(depth, ray));
-    }
-    let first_level = frame.channels[channel].first_level;
-    let coarsest = frame.channels[channel].last_level;
-    let preview = min(wanted.level + PREVIEW_LEVELS, coarsest);
-    var asked_for = 0u;
-    if misses_left > 0u {
-        asked_for = (1u << coarsest) | (1u << preview);
-    }
-    var coarser = (there | asked_for) & bits_below(coarsest + 1u) & ~bits_below(wanted.level + 1u);
-    while coarser != 0u {
-        let level = firstTrailingBit(coarser);
-        coarser &= coarser - 1u;
-        var other = source(channel, level, depth, ray);
-        if is_known(other.found) {
-            other.leaving = min(other.leaving, wanted.leaving);
-            return other;
-        }
-        // Few bricks, soon there: before all others, and the one that shows everything first.
-        if level == coarsest {
-            mark_missed(other.found, urgency * 1e-6);
-        } else if level == preview {
-            mark_missed(other.found, urgency * 1e-3);
-        }
-    }
-    let finest = max(wanted.level - min(wanted.level, FINER_SUBSTITUTES), first_level);
-    var finer = there & bits_below(wanted.level) & ~bits_below(finest);
-    while finer != 0u {
-        let level = firstLeadingBit(finer);
-        finer &= bits_below(level);
-        var other = source(channel, level, depth, ray);
-        if other.found.entry >= FIRST_SLOT {
-            other.leaving = min(other.leaving, wanted.leaving);
-            return other;
-        }
-    }
-    return wanted;
-}
-
 // Depth at which the level after this one is wanted: where a voxel's size is as far from one
 // level as from the other, in their ratio.
 fn depth_of_next(level: u32, ray: vec3f) -> f32 {
-    if level + 1u >= frame.level_count {
+    if level + 1u >= level_count() {
         return 3e38;
     }
     let here = projected_size(1.0 / frame.levels[level].voxels_per_nm, ray);
@@ -167,60 +108,122 @@ var<private> drawn_for: array<u32, SLOTS>;
 // A bit per channel: nothing is known of the brick; nothing of it is seen.
 var<private> missing: u32;
 var<private> transparent: u32;
-// Of the brick that is drawn: the first sample [texels], and the way to the next per depth.
+// Of the brick that is drawn, as the sampler counts: the first sample, the way to the next per depth, the
+// lowest corner and what a voxel is.
 var<private> first_texel: array<vec3f, SLOTS>;
 var<private> texels_per_depth: array<vec3f, SLOTS>;
 var<private> low_texel: array<vec3f, SLOTS>;
+var<private> texel: vec3f;
 // The sample before, of surfaces [0, 1].
 var<private> sample_before: array<f32, SLOTS>;
 
-// Looks up what is drawn of a channel from `depth` on.
-fn look_up(channel: u32, wanted: u32, depth: f32, ray: vec3f, urgency: f32) {
+// The surface that ends a ray: its channel, its level and where it is.
+var<private> surface: u32;
+var<private> surface_level: u32;
+var<private> surface_at: vec3f;
+// Light that comes through to it; 0 where there is none.
+var<private> surface_light: f32;
+
+// Draws a channel from what was found.
+fn draw_from(channel: u32, here: Source) {
     let bit = 1u << channel;
-    var here = source(channel, wanted, depth, ray);
-    drawn_for[channel] = wanted;
-    var lacks = here.found.entry < EMPTY;
-    if lacks || here.found.stale {
-        mark_missed(here.found, depth * urgency);
-    }
-    if lacks && (frame.flags & FLAG_SUBSTITUTE) != 0u {
-        here = substitute(channel, here, depth, ray, depth * urgency);
-        lacks = here.found.entry < EMPTY;
-    } else if here.found.entry == EMPTY && !here.found.stale {
-        here = widened(channel, here, depth, ray);
-    }
     var unseen = true;
     if here.found.entry >= FIRST_SLOT {
         let slot = here.found.entry - FIRST_SLOT;
         mark_brick_used(slot);
         unseen = is_transparent(channel, slot);
     }
-    missing = select(missing & ~bit, missing | bit, lacks);
+    missing = select(missing & ~bit, missing | bit, here.found.entry < EMPTY);
     transparent = select(transparent & ~bit, transparent | bit, unseen);
     drawn[channel] = here;
+}
+
+// Looks up what is drawn of a channel from `depth` on; whether that is all there is to it.
+fn look_up(channel: u32, wanted: u32, depth: f32, ray: vec3f) -> bool {
+    let here = source(channel, wanted, depth, ray);
+    drawn_for[channel] = wanted;
+    draw_from(channel, here);
+    return here.found.entry >= FIRST_SLOT && !here.found.stale;
+}
+
+// The rest of a look-up: reports what is missing or stale and draws the nearest level that is there instead,
+// coarser ones first [001 alg. 7.2]; passes in one step what coarser levels know to be empty as well.
+fn look_further(channel: u32, depth: f32, ray: vec3f, urgency: f32) {
+    let wanted = drawn[channel];
+    let lacks = wanted.found.entry < EMPTY;
+    if lacks || wanted.found.stale {
+        mark_missed(wanted.found, urgency);
+    }
+    let widens = wanted.found.entry == EMPTY && !wanted.found.stale;
+    let first_level = frame.channels[channel].first_level;
+    let coarsest = frame.channels[channel].last_level;
+    let preview = min(wanted.level + PREVIEW_LEVELS, coarsest);
+    var coarser = 0u;
+    var finer = 0u;
+    if lacks && has_flag(FLAG_SUBSTITUTE) {
+        var there = 0xffffffffu;
+        if channel_has(channel, CHANNEL_RESIDENCY) {
+            there = levels_around(channel, cell_at(depth, ray));
+        }
+        var asked_for = 0u;
+        if misses_left > 0u {
+            asked_for = (1u << coarsest) | (1u << preview);
+        }
+        coarser = (there | asked_for) & bits_below(coarsest + 1u) & ~bits_below(wanted.level + 1u);
+        let finest = max(wanted.level - min(wanted.level, FINER_SUBSTITUTES), first_level);
+        finer = there & bits_below(wanted.level) & ~bits_below(finest);
+    } else if widens {
+        coarser = bits_below(level_count()) & ~bits_below(wanted.level + 1u);
+    }
+    var here = wanted;
+    while (coarser | finer) != 0u {
+        let is_coarser = coarser != 0u;
+        let level = select(firstLeadingBit(finer), firstTrailingBit(coarser), is_coarser);
+        if is_coarser {
+            coarser &= coarser - 1u;
+        } else {
+            finer &= bits_below(level);
+        }
+        let other = source(channel, level, depth, ray);
+        if widens {
+            if other.found.entry != EMPTY || other.found.stale {
+                break;
+            }
+            here.leaving = max(here.leaving, other.leaving);
+        } else if other.found.entry >= FIRST_SLOT || (is_coarser && other.found.entry >= EMPTY) {
+            here = other;
+            here.leaving = min(other.leaving, wanted.leaving);
+            break;
+        } else if is_coarser && (level == coarsest || level == preview) {
+            // Few bricks, soon there: before all others, and the one that shows everything first.
+            mark_missed(other.found, urgency * select(1e-3, 1e-6, level == coarsest));
+        }
+    }
+    draw_from(channel, here);
 }
 
 // Where samples from `depth` on lie in the brick cache.
 fn aim(channel: u32, depth: f32, ray: vec3f) {
     let here = drawn[channel];
-    let slot = here.found.entry - FIRST_SLOT;
-    let grid = frame.brick_grid;
-    let cell = vec3u(slot % grid.x, slot / grid.x % grid.y, slot / (grid.x * grid.y));
-    let corner = vec3f(cell * BRICK_STORED_EDGE + BRICK_BORDER);
+    // Whole numbers below 2^22: exact, and quicker than dividing integers.
+    let grid = vec3f(frame.brick_grid);
+    let slot = f32(here.found.entry - FIRST_SLOT) + 0.5;
+    let row = floor(slot / grid.x);
+    let layer = floor(slot / (grid.x * grid.y));
+    let cell = vec3f(floor(slot) - row * grid.x, row - layer * grid.y, layer);
+    let corner = cell * f32(BRICK_STORED_EDGE) + f32(BRICK_BORDER);
     let voxels = ray * frame.levels[here.level].voxels_per_nm;
-    low_texel[channel] = corner;
-    first_texel[channel] = frame.levels[here.level].eye - here.place.low + depth * voxels;
-    texels_per_depth[channel] = voxels;
+    low_texel[channel] = corner * texel;
+    first_texel[channel] = (corner + frame.levels[here.level].eye - here.place.low + depth * voxels) * texel;
+    texels_per_depth[channel] = voxels * texel;
 }
 
-// The stored value at a place in a channel's brick [voxels from its low corner], from 0 to 1.
-fn stored_at(channel: u32, in_brick: vec3f) -> f32 {
-    let at = low_texel[channel] + in_brick;
+// The stored value at a place in the brick cache, as the sampler counts, from 0 to 1.
+fn stored_at(at: vec3f) -> f32 {
     if JOINED {
         return stored_of_parts(at);
     }
-    let texel = 1.0 / vec3f(frame.brick_grid * BRICK_STORED_EDGE);
-    return textureSampleLevel(bricks, bricks_sampler, at * texel, 0.0).r;
+    return textureSampleLevel(bricks, bricks_sampler, at, 0.0).r;
 }
 
 // Interpolated from two parts of 8 bit. Samplers may round each part to 8 bit again, which is
@@ -250,27 +253,32 @@ fn joined(texel: vec3i) -> f32 {
     return dot(textureLoad(bricks, texel, 0).rg, frame.combine);
 }
 
+// A place in a channel's brick, so far ahead of the first sample.
 fn in_brick(channel: u32, ahead: f32) -> vec3f {
     let at = first_texel[channel] + ahead * texels_per_depth[channel];
-    return clamp(at, vec3f(0.0), vec3f(f32(BRICK_EDGE)));
+    return clamp(at, low_texel[channel], low_texel[channel] + f32(BRICK_EDGE) * texel);
 }
 
-// Light from a surface in a channel's brick: as bright as it faces the eye.
-fn lit_surface(channel: u32, ahead: f32, ray: vec3f) -> vec3f {
-    let at = in_brick(channel, ahead);
-    let x = vec3f(0.5, 0.0, 0.0);
+// Light from the surface that ended the ray: as bright as it faces the eye.
+fn lit_surface(ray: vec3f) -> vec3f {
+    let x = vec3f(0.5, 0.0, 0.0) * texel;
+    let y = vec3f(0.0, 0.5, 0.0) * texel;
+    let z = vec3f(0.0, 0.0, 0.5) * texel;
+    let at = surface_at;
     let slope = vec3f(
-        stored_at(channel, at + x) - stored_at(channel, at - x),
-        stored_at(channel, at + x.yxz) - stored_at(channel, at - x.yxz),
-        stored_at(channel, at + x.yzx) - stored_at(channel, at - x.yzx),
+        stored_at(at + x) - stored_at(at - x),
+        stored_at(at + y) - stored_at(at - y),
+        stored_at(at + z) - stored_at(at - z),
     );
-    let gradient = slope * frame.levels[drawn[channel].level].voxels_per_nm;
+    let gradient = slope * frame.levels[surface_level].voxels_per_nm;
     let facing = abs(dot(gradient, ray)) / max(length(gradient) * length(ray), 1e-30);
     // Where values do not change there is no surface to light: as if it faced the eye.
     let diffuse = select(facing, 1.0, length(gradient) <= 1e-30);
-    return color_of(channel, transfer[channel].iso).rgb * (0.15 + 0.85 * diffuse);
+    return color_of(surface, transfer[surface].iso).rgb * (0.15 + 0.85 * diffuse);
 }
 
+// Loops, from the outside: look-ups that find no brick at once; stretches of one level and step; regions with
+// nothing to see; bricks; samples.
 fn trace(pixel: vec2u) -> vec3f {
     let from_middle = (vec2f(pixel) + 0.5) / vec2f(frame.size) * 2.0 - 1.0;
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
@@ -280,9 +288,10 @@ fn trace(pixel: vec2u) -> vec3f {
         depths = clipped_depths(depths, frame.planes[p], ray);
     }
     let urgency = 1.0 + dot(from_middle, from_middle);
-    let sample_at = select(0.5, pixel_noise(pixel), (frame.flags & FLAG_JITTER) != 0u);
-    let false_colors = (frame.flags & FLAG_FALSE_COLORS) != 0u;
+    let sample_at = select(0.5, pixel_noise(pixel), has_flag(FLAG_JITTER));
+    let false_colors = has_flag(FLAG_FALSE_COLORS);
     let everything = all_channels();
+    texel = select(1.0 / vec3f(frame.brick_grid * BRICK_STORED_EDGE), vec3f(1.0), JOINED);
 
     var light = vec3f(0.0);
     var transmitted = 1.0;
@@ -290,159 +299,222 @@ fn trace(pixel: vec2u) -> vec3f {
     var level = 0u;
     var level_end = -1.0;
     var segments = 0u;
+    // Channels whose brick is not simply there, and those that were looked for further.
+    var lost = 0u;
+    var found = 0u;
     missing = 0u;
     transparent = 0u;
+    surface_light = 0.0;
     for (var c = 0u; c < channel_count(); c += 1u) {
         drawn_for[c] = MAX_LEVELS;
         largest_seen[c] = 0.0;
         sample_before[c] = 0.0;
     }
-    rays = select(0u, 1u, start < depths.y && frame.level_count > 0u);
-    while start < depths.y && transmitted > TERMINATION && frame.level_count > 0u {
-        while start >= level_end {
-            if level_end >= 0.0 {
-                level += 1u;
+    rays = select(0u, 1u, start < depths.y && level_count() > 0u);
+    var going = rays > 0u;
+    while going {
+        var depth = start;
+        loop {
+            going = start < depths.y && transmitted > TERMINATION;
+            if !going {
+                break;
             }
-            level_end = depth_of_next(level, ray);
-        }
-        var finest_drawn = MAX_LEVELS;
-        for (var c = 0u; c < channel_count(); c += 1u) {
-            finest_drawn = min(finest_drawn, channel_level(c, level));
-        }
-        finest = min(finest, finest_drawn);
-
-        let voxels_per_depth = length(ray * frame.levels[finest_drawn].voxels_per_nm);
-        let doublings = min(segments / SEGMENTS_PER_DOUBLING, 64u);
-        let step = 0.5 / voxels_per_depth * exp2(f32(doublings));
-        let first = min(step, depths.y - start);
-        let depth = start + sample_at * first;
-
-        // Depth of the first sample that may need another level, and of the ray's end.
-        var until = min(level_end + sample_at * step, depths.y + sample_at * step);
-        var around = until;
-        var hidden = 0u;
-        if (frame.flags & FLAG_OCTREE) != 0u {
-            let region = region_at(level, depth, ray);
-            hidden = region.hidden;
-            around = region.leaving;
-            let even = MODE == MODE_EMISSION_ABSORPTION && (hidden | region.uniform_) == everything;
-            if hidden == everything || even {
-                let count = segments_until(min(until, around), depth, step);
-                if hidden != everything {
-                    var sum = vec4f(0.0);
-                    for (var c = 0u; c < channel_count(); c += 1u) {
-                        if (hidden & (1u << c)) == 0u {
-                            let color = color_of(c, uniform_stored[c]);
-                            sum += vec4f(color.a * color.rgb, color.a);
-                        }
-                    }
-                    if sum.a > 0.0 {
-                        let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
-                        let opacity = opacity_of_length(sum.a, thickness * nm_per_depth);
-                        light += transmitted * opacity * sum.rgb / sum.a;
-                        transmitted *= 1.0 - opacity;
-                    }
+            while start >= level_end {
+                if level_end >= 0.0 {
+                    level += 1u;
                 }
+                level_end = depth_of_next(level, ray);
+            }
+            var finest_drawn = MAX_LEVELS;
+            for (var c = 0u; c < channel_count(); c += 1u) {
+                finest_drawn = min(finest_drawn, channel_level(c, level));
+            }
+            finest = min(finest, finest_drawn);
+            let voxels_per_depth = length(ray * frame.levels[finest_drawn].voxels_per_nm);
+            let doublings = min(segments / SEGMENTS_PER_DOUBLING, 64u);
+            let step = 0.5 / voxels_per_depth * exp2(f32(doublings));
+            // Level and step hold up to here.
+            let stretch = min(level_end, depths.y);
+            let doubling = (segments / SEGMENTS_PER_DOUBLING + 1u) * SEGMENTS_PER_DOUBLING;
+
+            // Past regions with nothing to see.
+            var region = Region(0u, 0u, 3e38);
+            var is_seen = true;
+            loop {
+                depth = start + sample_at * min(step, depths.y - start);
+                if has_flag(FLAG_OCTREE) {
+                    region = region_at(level, depth, ray);
+                }
+                is_seen = region.hidden != everything;
+                if is_seen {
+                    break;
+                }
+                let count = segments_until(min(stretch + sample_at * step, region.leaving), depth, step);
+                start += f32(count) * step;
+                segments += count;
+                found = 0u;
                 for (var c = 0u; c < channel_count(); c += 1u) {
                     sample_before[c] = 0.0;
+                }
+                if start >= stretch || segments >= doubling {
+                    break;
+                }
+            }
+            if !is_seen {
+                continue;
+            }
+            let hidden = region.hidden;
+            let around = region.leaving;
+
+            if MODE == MODE_EMISSION_ABSORPTION && (hidden | region.uniform_) == everything {
+                let count = segments_until(min(stretch + sample_at * step, around), depth, step);
+                var sum = vec4f(0.0);
+                for (var c = 0u; c < channel_count(); c += 1u) {
+                    if (hidden & (1u << c)) == 0u {
+                        let color = color_of(c, uniform_stored[c]);
+                        sum += vec4f(color.a * color.rgb, color.a);
+                    }
+                }
+                if sum.a > 0.0 {
+                    let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
+                    let opacity = opacity_of_length(sum.a, thickness * nm_per_depth);
+                    light += transmitted * opacity * sum.rgb / sum.a;
+                    transmitted *= 1.0 - opacity;
                 }
                 start += f32(count) * step;
                 segments += count;
                 continue;
             }
-        }
 
-        for (var c = 0u; c < channel_count(); c += 1u) {
-            let bit = 1u << c;
-            if (hidden & bit) != 0u {
-                until = min(until, around);
-                sample_before[c] = 0.0;
-                continue;
-            }
-            let wanted = channel_level(c, level);
-            if wanted != drawn_for[c] || depth >= drawn[c].leaving {
-                look_up(c, wanted, depth, ray, urgency * f32(1u + frame.channels[c].coarser));
-            }
-            // Where nothing of a brick is seen, it is passed as a whole.
-            until = min(until, drawn[c].leaving);
-            if (transparent & bit) == 0u {
-                until = min(until, around);
-            }
-        }
-        let count = segments_until(until, depth, step);
-
-        let sampled = everything & ~hidden & ~transparent;
-        for (var c = 0u; c < channel_count(); c += 1u) {
-            let bit = 1u << c;
-            if (hidden & bit) == 0u && drawn[c].found.entry >= FIRST_SLOT {
-                let distance = i32(drawn[c].level) - i32(drawn_for[c]);
-                if distance != 0 {
-                    substituted_levels = max(substituted_levels, u32(abs(distance)));
-                    substituted += count;
-                }
-            }
-            if (sampled & bit) != 0u {
-                aim(c, depth, ray);
-            } else {
-                sample_before[c] = 0.0;
-            }
-        }
-        if sampled != 0u {
-            for (var i = 0u; i < count && transmitted > TERMINATION; i += 1u) {
-                let segment = min(step, depths.y - start - f32(i) * step);
-                let ahead = f32(i) * step + sample_at * (segment - first);
-                var sum = vec4f(0.0);
-                var surface_at = 3e38;
-                var surface = 0u;
+            // From brick to brick within the region.
+            loop {
+                let first = min(step, depths.y - start);
+                depth = start + sample_at * first;
+                var until = stretch + sample_at * step;
+                lost = 0u;
                 for (var c = 0u; c < channel_count(); c += 1u) {
-                    if (sampled & (1u << c)) == 0u {
+                    let bit = 1u << c;
+                    if (hidden & bit) != 0u {
+                        until = min(until, around);
+                        sample_before[c] = 0.0;
                         continue;
                     }
-                    let stored = stored_at(c, in_brick(c, ahead));
-                    samples += 1u;
-                    if MODE == MODE_MAXIMUM {
-                        largest_seen[c] = max(largest_seen[c], stored);
-                    } else if MODE == MODE_ISO_SURFACE {
-                        let iso = transfer[c].iso;
-                        if stored >= iso {
-                            let rise = stored - sample_before[c];
-                            let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);
-                            let at = ahead - back * step;
-                            if at < surface_at {
-                                surface_at = at;
-                                surface = c;
-                            }
+                    let wanted = channel_level(c, level);
+                    let holds = wanted == drawn_for[c] && depth < drawn[c].leaving;
+                    if !holds && (found & bit) == 0u {
+                        if !look_up(c, wanted, depth, ray) {
+                            lost |= bit;
                         }
-                        sample_before[c] = stored;
-                    } else {
-                        var color = color_of(c, stored);
-                        let distance = i32(drawn[c].level) - i32(drawn_for[c]);
-                        if false_colors && distance != 0 {
-                            color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
-                        }
-                        sum += vec4f(color.a * color.rgb, color.a);
+                    }
+                    // Where nothing of a brick is seen, it is passed as a whole.
+                    until = min(until, drawn[c].leaving);
+                    if (transparent & bit) == 0u {
+                        until = min(until, around);
                     }
                 }
-                if sum.a > 0.0 {
-                    let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
-                    light += transmitted * opacity * sum.rgb / sum.a;
+                if lost != 0u {
+                    break;
+                }
+                found = 0u;
+                let count = segments_until(until, depth, step);
+
+                let sampled = everything & ~hidden & ~transparent;
+                for (var c = 0u; c < channel_count(); c += 1u) {
+                    let bit = 1u << c;
+                    if (hidden & bit) == 0u && drawn[c].found.entry >= FIRST_SLOT {
+                        let distance = i32(drawn[c].level) - i32(drawn_for[c]);
+                        if distance != 0 {
+                            substituted_levels = max(substituted_levels, u32(abs(distance)));
+                            substituted += count;
+                        }
+                    }
+                    if (sampled & bit) != 0u {
+                        aim(c, depth, ray);
+                    } else {
+                        sample_before[c] = 0.0;
+                    }
+                }
+                var left = select(0u, count, sampled != 0u);
+                samples += left * countOneBits(sampled);
+                var i = 0.0;
+                while left > 0u && transmitted > TERMINATION {
+                    let segment = min(step, depths.y - start - i * step);
+                    let ahead = i * step + sample_at * (segment - first);
+                    var sum = vec4f(0.0);
+                    var hit_at = 3e38;
+                    for (var c = 0u; c < channel_count(); c += 1u) {
+                        if SLOTS > 1u && (sampled & (1u << c)) == 0u {
+                            continue;
+                        }
+                        let stored = stored_at(in_brick(c, ahead));
+                        if MODE == MODE_MAXIMUM {
+                            largest_seen[c] = max(largest_seen[c], stored);
+                        } else if MODE == MODE_ISO_SURFACE {
+                            let iso = transfer[c].iso;
+                            if stored >= iso {
+                                let rise = stored - sample_before[c];
+                                let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);
+                                let at = ahead - back * step;
+                                if at < hit_at {
+                                    hit_at = at;
+                                    surface = c;
+                                    surface_level = drawn[c].level;
+                                    surface_at = in_brick(c, at);
+                                }
+                            }
+                            sample_before[c] = stored;
+                        } else {
+                            var color = color_of(c, stored);
+                            let distance = i32(drawn[c].level) - i32(drawn_for[c]);
+                            if false_colors && distance != 0 {
+                                color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
+                            }
+                            sum += vec4f(select(color.a * color.rgb, color.rgb, SLOTS == 1u), color.a);
+                        }
+                    }
+                    if MODE == MODE_EMISSION_ABSORPTION {
+                        let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
+                        let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
+                        light += transmitted * opacity * share * sum.rgb;
+                        transmitted *= 1.0 - opacity;
+                    }
+                    if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
+                        surface_light = transmitted;
+                        transmitted = 0.0;
+                    }
+                    i += 1.0;
+                    left -= 1u;
+                }
+                samples -= left * countOneBits(sampled);
+                if (missing & ~hidden) != 0u && false_colors {
+                    // A thin magenta fog: half the light is gone after 64 voxels.
+                    let voxels = f32(count) * step * voxels_per_depth;
+                    let opacity = 1.0 - exp2(-voxels / 64.0);
+                    light += transmitted * opacity * vec3f(0.6, 0.0, 0.4);
                     transmitted *= 1.0 - opacity;
                 }
-                if surface_at < 3e38 {
-                    light += transmitted * lit_surface(surface, surface_at, ray);
-                    transmitted = 0.0;
+                start += f32(count) * step;
+                segments += count;
+                depth = start + sample_at * min(step, depths.y - start);
+                if depth >= around || start >= stretch || segments >= doubling || transmitted <= TERMINATION {
+                    break;
                 }
             }
+            if lost != 0u {
+                break;
+            }
         }
-        if (missing & ~hidden) != 0u && false_colors {
-            // A thin magenta fog: half the light is gone after 64 voxels.
-            let voxels = f32(count) * step * voxels_per_depth;
-            let opacity = 1.0 - exp2(-voxels / 64.0);
-            light += transmitted * opacity * vec3f(0.6, 0.0, 0.4);
-            transmitted *= 1.0 - opacity;
+        for (var c = 0u; c < channel_count(); c += 1u) {
+            let bit = 1u << c;
+            if (lost & bit) != 0u {
+                look_further(c, depth, ray, depth * urgency * f32(1u + frame.channels[c].coarser));
+                found |= bit;
+            }
         }
-        start += f32(count) * step;
-        segments += count;
+        lost = 0u;
+    }
+    if MODE == MODE_ISO_SURFACE && surface_light > 0.0 {
+        light += surface_light * lit_surface(ray);
     }
     if MODE == MODE_MAXIMUM {
         // The light of what was met, or the background where nothing was.
@@ -462,7 +534,7 @@ fn trace(pixel: vec2u) -> vec3f {
 
 // What is drawn instead of the volume, if asked for: how much work a ray was.
 fn heat_of(color: vec3f) -> vec3f {
-    switch frame.heat {
+    switch frame.heat | nothing {
         case HEAT_LOOKUPS: {
             return heat_color(f32(lookups) / frame.heat_full);
         }
@@ -480,10 +552,16 @@ fn heat_of(color: vec3f) -> vec3f {
 
 @compute @workgroup_size(WORKGROUP, WORKGROUP)
 fn main(
-    @builtin(global_invocation_id) id: vec3u,
+    @builtin(workgroup_id) group: vec3u,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let pixel = vec2u(id.x, id.y + frame.first_row);
+    // Neighbours in both directions are drawn together: their rays meet the same bricks.
+    let within = vec2u(
+        (local & 3u) | ((local >> 1u) & 4u),
+        ((local >> 2u) & 1u) | ((local >> 3u) & 6u),
+    );
+    nothing = group.x >> 31u;
+    let pixel = group.xy * WORKGROUP + within + vec2u(0u, frame.first_row);
     if all(pixel < frame.size) {
         let color = heat_of(trace(pixel));
         textureStore(image, pixel, vec4f(srgb_from_linear(color), 1.0));
