@@ -8,12 +8,14 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail, ensure};
-use glam::{DVec3, UVec3};
-use saccade_core::volume::Volume;
+use anyhow::{Context, Result, ensure};
+use glam::UVec3;
+use saccade_archive::VisualizationArchive;
 use saccade_core::voxel_box::VoxelBox;
+use saccade_ingest::Cancel;
+use saccade_ingest::ingest::{self, IngestOptions};
 use saccade_serve::{Options, Server, Volumes};
-use saccade_source::memory::ArraySource;
+use saccade_source::stitched::{StitchedOptions, StitchedSource};
 use saccade_source::{Chunk, ChunkId, VolumeSource};
 use tempfile::TempDir;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
@@ -23,6 +25,7 @@ use tokio::runtime::Runtime;
 use crate::clock::Stopwatch;
 use crate::report::Row;
 use crate::rows::runtime;
+use crate::scene::{Mosaic, NAME};
 
 const SLOWLORIS: &str = "serve.slowloris_p99_ratio";
 const NGINX: &str = "serve.vs_nginx";
@@ -67,7 +70,7 @@ pub(crate) fn measure_slowloris() -> Result<Vec<Row>> {
         .setting("slow sockets", slow)
         .setting("a byte every", "1 s each")
         .setting("requests per run", REQUESTS)
-        .setting("chunk", "64 x 64 x 32, from memory")
+        .setting("chunk", "64 x 64 x 32, stitched before")
         .setting("idle p99 [ms]", rounded(&p99[0]))
         .setting("p99 among them [ms]", rounded(&p99[1]));
     Ok(vec![row])
@@ -146,7 +149,7 @@ pub(crate) fn measure_nginx() -> Result<Vec<Row>> {
         .setting("seconds per run", LOAD.as_secs())
         .setting(
             "chunk",
-            "64 x 64 x 32, from memory, nginx's from cached files",
+            "64 x 64 x 32, stitched before, nginx's from cached files",
         )
         .setting("requests per second", rounded(&rates[0]))
         .setting("nginx's", rounded(&rates[1]))
@@ -260,27 +263,27 @@ fn nginx_program() -> Option<PathBuf> {
 
 // --- what both need -----------------------------------------------------------------------------
 
-/// A server in this process, with threads of its own, and what it serves.
+/// A server in this process, with threads of its own, and what it serves: chunks stitched out of tiles, all
+/// of which were asked for before.
 struct Served {
     _runtime: Runtime,
+    _archive: TempDir,
     address: SocketAddr,
     chunks: Vec<(String, Vec<u8>)>,
 }
 
+const MOSAIC: Mosaic = Mosaic {
+    edge: 512,
+    side: 2,
+    sections: 64,
+};
+
 impl Served {
     fn new() -> Result<Self> {
-        let extent = UVec3::new(512, 512, 128);
-        let mut volume = Volume::new("em", extent, DVec3::splat(8.0))?;
-        volume.levels.truncate(1);
-        let mut choice = Choice(7);
-        let voxels = VoxelBox::of_size(extent).iter();
-        // Never 0: no chunk is absent.
-        let values = voxels
-            .map(|_| u8::try_from(choice.next() >> 56).unwrap_or(1) | 1)
-            .collect();
-        let source = Arc::new(ArraySource::new(volume, values)?);
+        let folder = TempDir::with_prefix("saccade-served-")?;
         let runtime = runtime()?;
-        let (server, chunks) = runtime.block_on(async {
+        let (server, source, chunks) = runtime.block_on(async {
+            let source = Arc::new(stitched(folder.path()).await?);
             let server = Server::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).await?;
             let mut chunks = Vec::new();
             for chunk in VoxelBox::of_size(source.volume().chunks(0)).iter() {
@@ -289,13 +292,14 @@ impl Served {
                     level: 0,
                     chunk,
                 };
+                // Beyond the tiles there is nothing.
                 let Chunk::Voxels(bytes) = source.read(id).await? else {
-                    bail!("{id} is empty")
+                    continue;
                 };
                 let UVec3 { x, y, z } = chunk;
-                chunks.push((format!("/v/em/zarr/0/c/0/{z}/{y}/{x}"), bytes.to_vec()));
+                chunks.push((format!("/v/{NAME}/zarr/0/c/0/{z}/{y}/{x}"), bytes.to_vec()));
             }
-            anyhow::Ok((server, chunks))
+            anyhow::Ok((server, source, chunks))
         })?;
         let address = server.address();
         let volumes = Volumes::new();
@@ -305,6 +309,7 @@ impl Served {
         drop(_inside);
         Ok(Self {
             _runtime: runtime,
+            _archive: folder,
             address,
             chunks,
         })
@@ -313,6 +318,19 @@ impl Served {
     fn keys(&self) -> Vec<String> {
         self.chunks.iter().map(|(key, _)| key.clone()).collect()
     }
+}
+
+/// A mosaic taken in, as `saccade serve` opens it.
+async fn stitched(folder: &Path) -> Result<StitchedSource> {
+    let acquisition = folder.join("acquisition");
+    MOSAIC.acquire(&acquisition)?;
+    let archive = VisualizationArchive::create(&folder.join("archive")).await?;
+    let options = IngestOptions {
+        once: true,
+        ..Default::default()
+    };
+    ingest::run(&acquisition, &archive, &options, &(), &Cancel::new()).await?;
+    Ok(StitchedSource::open(&archive, NAME, StitchedOptions::default()).await?)
 }
 
 /// One connection that is kept, and as little work as possible on this side of it.
@@ -327,7 +345,7 @@ impl Client {
         let stream = TcpStream::connect(server).await?;
         stream.set_nodelay(true)?;
         Ok(Self {
-            stream: BufReader::with_capacity(64 * 1024, stream),
+            stream: BufReader::with_capacity(4 * 1024, stream),
             line: String::new(),
             body: Vec::new(),
         })
