@@ -1,11 +1,14 @@
 //! The server under load: beside nginx, and among clients that mean no good.
 
 use std::fs;
+use std::io::Write as _;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, mpsc};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
@@ -53,14 +56,11 @@ pub(crate) fn measure_slowloris() -> Result<Vec<Row>> {
     let slow = slow_sockets();
     for _ in 0..RUNS {
         let idle = client.block_on(good_client(served.address, &keys))?;
-        let attackers = runtime()?;
-        for index in 0..slow {
-            attackers.spawn(slow_client(served.address, index, slow));
-        }
-        // All are connected, and have begun to send.
-        client.block_on(async { tokio::time::sleep(3 * BYTE).await });
+        let attackers = Attackers::start(served.address, slow)?;
+        // The answers to their arrival are over.
+        client.block_on(async { tokio::time::sleep(BYTE).await });
         let attacked = client.block_on(good_client(served.address, &keys))?;
-        attackers.shutdown_background();
+        attackers.stop();
         client.block_on(async { tokio::time::sleep(BYTE).await });
         ratios.push(attacked / idle);
         p99[0].push(idle * 1e3);
@@ -86,22 +86,60 @@ fn slow_sockets() -> usize {
     SLOW.min(files.unwrap_or(256) / 2)
 }
 
-/// A request that is never finished; begun again when the server ends the connection.
-async fn slow_client(server: SocketAddr, index: usize, of: usize) {
-    // Spread over the first second.
-    tokio::time::sleep(BYTE.mul_f64(index as f64 / of as f64)).await;
-    loop {
-        if let Ok(mut stream) = TcpStream::connect(server).await {
-            let mut sent = stream
-                .write_all(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ")
-                .await;
-            while sent.is_ok() {
-                tokio::time::sleep(BYTE).await;
-                sent = stream.write_all(b"z").await;
+/// Ten thousand requests that are never finished, from one thread that does nothing else: attackers would sit on
+/// other computers, and what theirs costs here is not the server's.
+struct Attackers {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+}
+
+impl Attackers {
+    /// Begins; returns once all have sent the beginning of a request.
+    fn start(server: SocketAddr, sockets: usize) -> Result<Self> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let (all, connected) = mpsc::channel();
+        let stopping = stop.clone();
+        let thread = std::thread::spawn(move || {
+            let mut streams: Vec<_> = (0..sockets).map(|_| slow_client(server)).collect();
+            all.send(streams.iter().flatten().count()).ok();
+            let (mut next, watch) = (0, Stopwatch::start());
+            while !stopping.load(Ordering::Relaxed) {
+                let bytes = watch.elapsed().div_duration_f64(BYTE) * sockets as f64;
+                while (next as f64) < bytes {
+                    let stream = &mut streams[next % sockets];
+                    let sent = { stream.as_ref() }.is_some_and(|mut s| s.write_all(b"z").is_ok());
+                    if !sent {
+                        // The server ended it.
+                        *stream = slow_client(server);
+                    }
+                    next += 1;
+                }
+                std::thread::sleep(PAUSE);
             }
-        }
-        tokio::time::sleep(BYTE).await;
+        });
+        let connected = connected.recv().context("the attackers are gone")?;
+        ensure!(
+            connected * 10 > sockets * 9,
+            "{connected} of {sockets} slow sockets"
+        );
+        Ok(Self { stop, thread })
     }
+
+    fn stop(self) {
+        self.stop.store(true, Ordering::Relaxed);
+        drop(self.thread.join());
+    }
+}
+
+/// Bytes come one by one, as from many places, and not in a burst.
+const PAUSE: Duration = Duration::from_micros(100);
+
+fn slow_client(server: SocketAddr) -> Option<std::net::TcpStream> {
+    let mut stream = std::net::TcpStream::connect(server).ok()?;
+    stream.set_nonblocking(true).ok()?;
+    let head = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ";
+    stream.write_all(head).ok()?;
+    Some(stream)
 }
 
 /// The 99th percentile of one client's requests \[s\].
