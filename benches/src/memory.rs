@@ -43,10 +43,13 @@ mod tests {
 
     #[test]
     fn a_peak_stays_until_it_is_reset() {
+        // Much more than the other tests, which run meanwhile, take and give back.
+        const TAKEN: usize = 512 << 20;
+        let half = TAKEN as u64 / 2;
         let before = reset_peak().unwrap();
-        drop(std::hint::black_box(vec![1_u8; 64 << 20]));
-        assert!(peak().unwrap() >= before + (60 << 20));
-        assert!(reset_peak().unwrap() < before + (32 << 20));
-        assert!(peak().unwrap() < before + (32 << 20));
+        drop(std::hint::black_box(vec![1_u8; TAKEN]));
+        assert!(peak().unwrap() >= before + half);
+        assert!(reset_peak().unwrap() < before + half);
+        assert!(peak().unwrap() < before + half);
     }
 }
