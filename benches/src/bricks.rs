@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use anyhow::{Result, ensure};
+use anyhow::{Result, bail};
 use glam::{DVec3, IVec3, UVec3};
 use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
 use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
@@ -85,9 +85,19 @@ pub(crate) fn ramp(low: f32, high: f32, opacity: f32, nm: f64) -> TransferFuncti
 pub(crate) fn settle(
     renderer: &mut Renderer,
     view: &View,
-    bricks: &impl Bricks,
+    bricks: &(impl Bricks + Sync),
 ) -> Result<FrameReport> {
-    for _ in 0..500 {
+    Ok(settle_loading(renderer, view, bricks)?.0)
+}
+
+/// The same; also tells which bricks were delivered.
+pub(crate) fn settle_loading(
+    renderer: &mut Renderer,
+    view: &View,
+    bricks: &(impl Bricks + Sync),
+) -> Result<(FrameReport, Vec<BrickId>)> {
+    let mut delivered = Vec::new();
+    for _ in 0..2_000 {
         renderer.render(view);
         let Some(report) = pollster::block_on(renderer.finish()).pop() else {
             continue;
@@ -100,18 +110,35 @@ pub(crate) fn settle(
             }
             renderer.render(view);
             let last = pollster::block_on(renderer.finish()).pop();
-            return last.ok_or_else(|| anyhow::anyhow!("a frame without a report"));
+            let last = last.ok_or_else(|| anyhow::anyhow!("a frame without a report"))?;
+            return Ok((last, delivered));
         }
-        for &id in &report.misses {
-            let voxels = bricks.brick(id);
+        for (&id, voxels) in report.misses.iter().zip(all_bricks(bricks, &report.misses)) {
             let voxels = voxels
                 .as_deref()
                 .map_or(BrickVoxels::Empty, BrickVoxels::Voxels);
             renderer.deliver(id, voxels)?;
+            delivered.push(id);
         }
     }
-    ensure!(false, "the view does not settle");
-    unreachable!()
+    bail!("the view does not settle")
+}
+
+/// Bricks, by all cores.
+pub(crate) fn all_bricks(source: &(impl Bricks + Sync), ids: &[BrickId]) -> Vec<Option<Vec<u8>>> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let per_thread = ids.len().div_ceil(threads).max(1);
+    std::thread::scope(|scope| {
+        let parts = ids
+            .chunks(per_thread)
+            .map(|ids| scope.spawn(move || ids.iter().map(|id| source.brick(*id)).collect()));
+        let parts: Vec<_> = parts.collect();
+        let done = parts.into_iter().map(|part| match part.join() {
+            Ok(bricks) => bricks,
+            Err(panic) => std::panic::resume_unwind(panic),
+        });
+        done.collect::<Vec<Vec<_>>>().concat()
+    })
 }
 
 /// Time of one frame, from asking for it until the GPU has finished it \[ms\].

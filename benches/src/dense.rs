@@ -136,40 +136,46 @@ impl Dense {
     /// The picture, RGBA.
     #[cfg(test)]
     fn pixels(&self) -> Vec<u8> {
-        let (device, queue) = (self.gpu.device(), self.gpu.queue());
-        let (width, height) = (self.image.width(), self.image.height());
-        let row = (width * 4).next_multiple_of(256);
-        let buffer = device.create_buffer(&wgpu::BufferDescriptor {
-            label: None,
-            size: u64::from(row * height),
-            usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
-            mapped_at_creation: false,
-        });
-        let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        encoder.copy_texture_to_buffer(
-            self.image.as_image_copy(),
-            wgpu::TexelCopyBufferInfo {
-                buffer: &buffer,
-                layout: wgpu::TexelCopyBufferLayout {
-                    offset: 0,
-                    bytes_per_row: Some(row),
-                    rows_per_image: None,
-                },
-            },
-            self.image.size(),
-        );
-        queue.submit([encoder.finish()]);
-        buffer.map_async(wgpu::MapMode::Read, .., |result| {
-            result.expect("it is mapped once")
-        });
-        device
-            .poll(wgpu::PollType::wait_indefinitely())
-            .expect("the device is there");
-        let mapped = buffer.get_mapped_range(..).expect("it was mapped");
-        let rows = mapped.chunks_exact(row as usize);
-        rows.flat_map(|row| row[..width as usize * 4].to_vec())
-            .collect()
+        read_image(&self.gpu, &self.image)
     }
+}
+
+/// A picture in main memory, RGBA.
+#[cfg(test)]
+pub(crate) fn read_image(gpu: &Gpu, image: &wgpu::Texture) -> Vec<u8> {
+    let (device, queue) = (gpu.device(), gpu.queue());
+    let (width, height) = (image.width(), image.height());
+    let row = (width * 4).next_multiple_of(256);
+    let buffer = device.create_buffer(&wgpu::BufferDescriptor {
+        label: None,
+        size: u64::from(row * height),
+        usage: wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ,
+        mapped_at_creation: false,
+    });
+    let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+    encoder.copy_texture_to_buffer(
+        image.as_image_copy(),
+        wgpu::TexelCopyBufferInfo {
+            buffer: &buffer,
+            layout: wgpu::TexelCopyBufferLayout {
+                offset: 0,
+                bytes_per_row: Some(row),
+                rows_per_image: None,
+            },
+        },
+        image.size(),
+    );
+    queue.submit([encoder.finish()]);
+    buffer.map_async(wgpu::MapMode::Read, .., |result| {
+        result.expect("it is mapped once")
+    });
+    device
+        .poll(wgpu::PollType::wait_indefinitely())
+        .expect("the device is there");
+    let mapped = buffer.get_mapped_range(..).expect("it was mapped");
+    let rows = mapped.chunks_exact(row as usize);
+    rows.flat_map(|row| row[..width as usize * 4].to_vec())
+        .collect()
 }
 
 fn frame(arrays: &Arrays, view: &View) -> Frame {
@@ -208,7 +214,7 @@ fn colors(transfer: &TransferFunction) -> Vec<[f32; 4]> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::bricks::{ramp, settle};
     use glam::{UVec2, UVec3};
@@ -216,7 +222,7 @@ mod tests {
     use saccade_render::{Renderer, RendererOptions, Traversal};
 
     /// Peak signal to noise of colours \[dB\].
-    fn psnr(a: &[u8], b: &[u8]) -> f64 {
+    pub(crate) fn psnr(a: &[u8], b: &[u8]) -> f64 {
         let squares = a
             .iter()
             .zip(b)
@@ -225,17 +231,22 @@ mod tests {
         10.0 * (255.0_f64.powi(2) / mean.max(1e-6)).log10()
     }
 
-    #[test]
-    #[expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
-    fn everything_measured_draws_the_same_picture() {
-        let gpu = match pollster::block_on(Gpu::headless()) {
-            Ok(gpu) => gpu,
+    /// A device; none where tests do without.
+    pub(crate) fn gpu() -> Option<Gpu> {
+        match pollster::block_on(Gpu::headless()) {
+            Ok(gpu) => Some(gpu),
             Err(error) => {
                 let required = std::env::var("SACCADE_GPU_TESTS").is_ok_and(|v| v == "require");
                 assert!(!required, "SACCADE_GPU_TESTS=require, but: {error}");
-                return;
+                None
             }
-        };
+        }
+    }
+
+    #[test]
+    #[expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
+    fn everything_measured_draws_the_same_picture() {
+        let Some(gpu) = gpu() else { return };
         let arrays = Arrays::new(UVec3::new(70, 61, 45), DVec3::new(4.0, 4.0, 10.0), |v| {
             let at = v.as_dvec3();
             let wave = (at.x / 5.0).sin() + (at.y / 4.0).cos() + (at.z / 3.0 + at.x / 9.0).sin();

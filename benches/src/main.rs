@@ -9,15 +9,19 @@
     reason = "a program that reports to its terminal"
 )]
 
+mod baselines;
 mod bricks;
 mod clock;
 mod cpu;
 mod dense;
 mod machine;
 mod memory;
+mod plot;
 mod report;
 mod rows;
 mod scene;
+mod settings;
+mod volumes;
 
 use std::fs;
 use std::path::PathBuf;
@@ -26,6 +30,8 @@ use anyhow::{Context, Result, bail};
 use clap::Parser;
 
 use crate::report::Report;
+use crate::settings::Settings;
+use crate::volumes::Scale;
 
 /// Measure Saccade.
 #[derive(Parser)]
@@ -33,6 +39,13 @@ struct Arguments {
     /// Also write the rows to this file.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    /// Write the plots of the papers' figures into this folder.
+    #[arg(long, value_name = "FOLDER")]
+    plots: Option<PathBuf>,
+    /// Size of the volumes and pictures of the papers' tables and figures. Without, as published where a GPU draws, and
+    /// small where a processor does.
+    #[arg(long, value_enum)]
+    scale: Option<Scale>,
     /// Rows to measure, by id; all when none is named.
     #[arg(value_name = "ID")]
     ids: Vec<String>,
@@ -41,10 +54,16 @@ struct Arguments {
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
     let wanted = wanted(&arguments.ids)?;
+    let settings = Settings {
+        ids: arguments.ids,
+        plots: arguments.plots,
+        scale: arguments.scale,
+    };
     let mut report = Report::new(machine::Machine::here());
     for group in wanted {
         eprintln!("measuring {} ...", group.ids.join(", "));
-        let rows = (group.measure)().with_context(|| format!("measuring {}", group.ids[0]))?;
+        let rows =
+            (group.measure)(&settings).with_context(|| format!("measuring {}", group.ids[0]))?;
         report.add(rows);
         if let Some(file) = &arguments.json {
             fs::write(file, report.json()?)

@@ -49,6 +49,16 @@ impl Row {
         self.value
     }
 
+    /// With these runs instead.
+    pub(crate) fn with_runs(self, runs: Vec<f64>) -> Self {
+        let value = median(&runs);
+        Self {
+            value,
+            runs,
+            ..self
+        }
+    }
+
     pub(crate) fn peer(mut self, value: f64, what: &'static str) -> Self {
         self.peer = Some(Peer { value, what });
         self

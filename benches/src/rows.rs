@@ -5,82 +5,110 @@ mod construct;
 mod first_light;
 mod index;
 mod ingest;
+mod petascale;
 mod render;
 mod resample;
 mod section;
 mod serve;
+mod table_9_1;
 mod versus;
 
 use anyhow::Result;
 
 use crate::report::Row;
+use crate::settings::Settings;
 
 /// Rows that share their set-up.
 pub(crate) struct Group {
     pub(crate) ids: &'static [&'static str],
-    pub(crate) measure: fn() -> Result<Vec<Row>>,
+    /// Measures those that are wanted, or all of the group.
+    pub(crate) measure: fn(&Settings) -> Result<Vec<Row>>,
 }
 
 pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: first_light::IDS,
-        measure: first_light::measure,
+        measure: |_| first_light::measure(),
     },
     Group {
         ids: ingest::IDS,
-        measure: ingest::measure,
+        measure: |_| ingest::measure(),
     },
     Group {
         ids: ingest::MEMORY_IDS,
-        measure: ingest::measure_memory,
+        measure: |_| ingest::measure_memory(),
     },
     Group {
         ids: ingest::SIMULATE_IDS,
-        measure: ingest::simulate,
+        measure: |_| ingest::simulate(),
     },
     Group {
         ids: codec::IDS,
-        measure: codec::measure,
+        measure: |_| codec::measure(),
     },
     Group {
         ids: construct::IDS,
-        measure: construct::measure,
+        measure: |_| construct::measure(),
     },
     Group {
         ids: section::IDS,
-        measure: section::measure,
+        measure: |_| section::measure(),
     },
     Group {
         ids: resample::IDS,
-        measure: resample::measure,
+        measure: |_| resample::measure(),
     },
     Group {
         ids: index::IDS,
-        measure: index::measure,
+        measure: |_| index::measure(),
     },
     Group {
         ids: render::IDS,
-        measure: render::measure,
+        measure: |_| render::measure(),
     },
     Group {
         ids: serve::SLOWLORIS_IDS,
-        measure: serve::measure_slowloris,
+        measure: |_| serve::measure_slowloris(),
     },
     Group {
         ids: serve::NGINX_IDS,
-        measure: serve::measure_nginx,
+        measure: |_| serve::measure_nginx(),
     },
     Group {
         ids: versus::DENSE_IDS,
-        measure: versus::vs_dense_texture,
+        measure: |_| versus::vs_dense_texture(),
     },
     Group {
         ids: versus::SMALL_IDS,
-        measure: versus::vs_small_volume,
+        measure: |_| versus::vs_small_volume(),
     },
     Group {
         ids: versus::PAGE_TABLES_IDS,
-        measure: versus::vs_page_tables,
+        measure: |_| versus::vs_page_tables(),
+    },
+    Group {
+        ids: table_9_1::IDS,
+        measure: table_9_1::measure,
+    },
+    Group {
+        ids: table_9_1::LEAF_IDS,
+        measure: table_9_1::leaf_sizes,
+    },
+    Group {
+        ids: petascale::TABLE_1_IDS,
+        measure: petascale::table_1,
+    },
+    Group {
+        ids: petascale::TABLE_2_IDS,
+        measure: petascale::table_2,
+    },
+    Group {
+        ids: petascale::FIGURE_6_IDS,
+        measure: petascale::figure_6,
+    },
+    Group {
+        ids: petascale::FIGURE_7_IDS,
+        measure: petascale::figure_7,
     },
 ];
 
