@@ -83,18 +83,37 @@ impl Dense {
         };
         let frame = frame(arrays, view);
         let frame = words(bytemuck::cast_slice(&frame), wgpu::BufferUsages::UNIFORM);
+        // As the renderer has them: a driver that draws on the CPU reads textures quicker than buffers.
         let colors = colors(transfer);
-        let colors = words(bytemuck::cast_slice(&colors), wgpu::BufferUsages::STORAGE);
+        let colors = device.create_texture_with_data(
+            gpu.queue(),
+            &wgpu::TextureDescriptor {
+                label: Some("dense"),
+                size: wgpu::Extent3d {
+                    width: 256,
+                    height: 1,
+                    depth_or_array_layers: 1,
+                },
+                mip_level_count: 1,
+                sample_count: 1,
+                dimension: wgpu::TextureDimension::D2,
+                format: wgpu::TextureFormat::Rgba32Float,
+                usage: wgpu::TextureUsages::TEXTURE_BINDING,
+                view_formats: &[],
+            },
+            wgpu::util::TextureDataOrder::LayerMajor,
+            bytemuck::cast_slice(&colors),
+        );
         let sampler = device.create_sampler(&wgpu::SamplerDescriptor {
             mag_filter: wgpu::FilterMode::Linear,
             min_filter: wgpu::FilterMode::Linear,
             ..Default::default()
         });
-        let [volume, picture] = [&volume, &image]
+        let [volume, picture, colors] = [&volume, &image, &colors]
             .map(|texture| texture.create_view(&wgpu::TextureViewDescriptor::default()));
         let resources = [
             frame.as_entire_binding(),
-            colors.as_entire_binding(),
+            wgpu::BindingResource::TextureView(&colors),
             wgpu::BindingResource::TextureView(&volume),
             wgpu::BindingResource::Sampler(&sampler),
             wgpu::BindingResource::TextureView(&picture),

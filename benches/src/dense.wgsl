@@ -13,7 +13,7 @@ struct Frame {
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 // Linear RGB, extinction [1/nm].
-@group(0) @binding(1) var<storage, read> colors: array<vec4f, 256>;
+@group(0) @binding(1) var colors: texture_2d<f32>;
 @group(0) @binding(2) var volume: texture_3d<f32>;
 @group(0) @binding(3) var trilinear: sampler;
 @group(0) @binding(4) var image: texture_storage_2d<rgba8unorm, write>;
@@ -44,7 +44,9 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         let position = (frame.eye + (start + 0.5 * segment) * ray) / frame.extent;
         let stored = textureSampleLevel(volume, trilinear, position, 0.0).r * 255.0;
         let entry = min(u32(stored), 254u);
-        let color = mix(colors[entry], colors[entry + 1u], stored - f32(entry));
+        let low = textureLoad(colors, vec2u(entry, 0u), 0);
+        let high = textureLoad(colors, vec2u(entry + 1u, 0u), 0);
+        let color = mix(low, high, stored - f32(entry));
         let opacity = 1.0 - exp(-color.a * segment * length(nm));
         light += transmitted * opacity * color.rgb;
         transmitted *= 1.0 - opacity;

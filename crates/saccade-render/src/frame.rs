@@ -1,7 +1,7 @@
 //! From a view to the numbers a frame's shader reads. Here f64 becomes f32.
 
 use bytemuck::Zeroable;
-use glam::{DVec3, IVec3, Vec2, Vec3, Vec4};
+use glam::{DVec3, IVec3, UVec3, Vec2, Vec3, Vec4};
 use saccade_core::brick::{BRICK_EDGE, MAX_LEVELS};
 use saccade_core::page_table::PageTables;
 use saccade_core::space::Point;
@@ -107,6 +107,7 @@ pub(crate) fn frame_uniform(
         let channel = seen.view.channel;
         let assigned = octree.is_some_and(|octree| octree.is_assigned(channel));
         let holds = assigned && values_hold;
+        let [first_opaque, last_opaque] = seen.table.opaque_entries();
         *uniform = ChannelUniform {
             directory_offset: channel * tables.entries_per_channel(),
             octree_slot: octree.and_then(|o| o.slot_of(channel)).unwrap_or(0),
@@ -118,6 +119,10 @@ pub(crate) fn frame_uniform(
             flags: flag(holds, CHANNEL_VALUES) | flag(holds && residency, CHANNEL_RESIDENCY),
             table_scale: seen.table.scale,
             table_offset: seen.table.offset,
+            first_opaque,
+            last_opaque,
+            visible_bins: seen.table.visible_bins,
+            iso: seen.table.iso,
         };
     }
     let (heat, heat_full) = match view.heat {
@@ -177,9 +182,9 @@ fn octree_uniform(octree: &ResidencyOctree, eye_nm: DVec3, voxel_nm: DVec3) -> O
     let mut depths = [DepthUniform::zeroed(); MOST_DEPTHS];
     for (depth, uniform) in (0..=geometry.deepest()).zip(&mut depths) {
         *uniform = DepthUniform {
-            shift: geometry.depth(depth).shift,
+            shift: bytes(geometry.depth(depth).shift),
+            bits: bytes(geometry.depth(depth).bits),
             residency: geometry.residency_at(depth),
-            bits: geometry.depth(depth).bits,
             pad_0: 0,
         };
     }
@@ -192,6 +197,11 @@ fn octree_uniform(octree: &ResidencyOctree, eye_nm: DVec3, voxel_nm: DVec3) -> O
         depths,
         ..OctreeUniform::zeroed()
     }
+}
+
+/// Small numbers, a byte per axis.
+fn bytes(numbers: UVec3) -> u32 {
+    numbers.x | numbers.y << 8 | numbers.z << 16
 }
 
 /// A position as a box of a grid near it, with edges of `edge`, and the rest, which is small unless

@@ -3,7 +3,6 @@
 use bytemuck::{Pod, Zeroable};
 use glam::{IVec3, UVec2, UVec3, Vec2, Vec3, Vec4};
 use saccade_core::brick::MAX_LEVELS;
-use saccade_core::transfer::TABLE_LEN;
 
 /// Edge of a workgroup \[pixels\].
 pub(crate) const WORKGROUP: u32 = 8;
@@ -112,9 +111,11 @@ pub(crate) struct LevelUniform {
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub(crate) struct DepthUniform {
-    pub(crate) shift: UVec3,
+    /// One byte per axis.
+    pub(crate) shift: u32,
+    /// One byte per axis.
+    pub(crate) bits: u32,
     pub(crate) residency: u32,
-    pub(crate) bits: UVec3,
     pub(crate) pad_0: u32,
 }
 
@@ -145,6 +146,10 @@ pub(crate) struct ChannelUniform {
     pub(crate) flags: u32,
     pub(crate) table_scale: f32,
     pub(crate) table_offset: f32,
+    pub(crate) first_opaque: f32,
+    pub(crate) last_opaque: f32,
+    pub(crate) visible_bins: u32,
+    pub(crate) iso: f32,
 }
 
 /// One frame. Fields are explained in `lib/frame.wgsl`.
@@ -177,21 +182,6 @@ pub(crate) struct FrameUniform {
     pub(crate) octree: OctreeUniform,
     pub(crate) channels: [ChannelUniform; MOST_CHANNELS],
     pub(crate) planes: [Vec4; MOST_PLANES],
-}
-
-/// Colours of a channel by stored value.
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C)]
-pub(crate) struct TransferStorage {
-    /// Linear RGB, extinction \[1/nm\].
-    pub(crate) colors: [[f32; 4]; TABLE_LEN],
-    /// Entries below an index that are not transparent.
-    pub(crate) opaque_before: [u32; TABLE_LEN + 1],
-    /// A bit per bin of stored values: whether any is not transparent.
-    pub(crate) visible_bins: u32,
-    /// Stored value of the surface, `[0, 1]`.
-    pub(crate) iso: f32,
-    pub(crate) pad_0: u32,
 }
 
 /// What a shader is made for: constants, so that compilers leave out what is not needed.
@@ -254,6 +244,7 @@ mod tests {
     use super::*;
     use crate::memory::Entry;
     use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE};
+    use saccade_core::transfer::TABLE_LEN;
     use std::mem::{offset_of, size_of};
 
     const VARIANTS: [(usize, u32, bool); 5] = [
@@ -457,7 +448,7 @@ mod tests {
             planes
         );
         assert_eq!(wgsl_struct(&module, "Frame"), frame);
-        let depth = rust_struct!(DepthUniform, shift, residency, bits);
+        let depth = rust_struct!(DepthUniform, shift, bits, residency);
         assert_eq!(wgsl_struct(&module, "Depth"), depth);
         let octree = rust_struct!(
             OctreeUniform,
@@ -478,10 +469,12 @@ mod tests {
             coarser,
             flags,
             table_scale,
-            table_offset
+            table_offset,
+            first_opaque,
+            last_opaque,
+            visible_bins,
+            iso
         );
         assert_eq!(wgsl_struct(&module, "Channel"), channel);
-        let transfer = rust_struct!(TransferStorage, colors, opaque_before, visible_bins, iso);
-        assert_eq!(wgsl_struct(&module, "Transfer"), transfer);
     }
 }

@@ -44,6 +44,11 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         has_dynamic_offset: false,
         min_binding_size: None,
     };
+    let texture = |view_dimension, filterable| wgpu::BindingType::Texture {
+        sample_type: wgpu::TextureSampleType::Float { filterable },
+        view_dimension,
+        multisampled: false,
+    };
     let types = [
         wgpu::BindingType::Buffer {
             ty: wgpu::BufferBindingType::Uniform,
@@ -55,12 +60,8 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         storage(true),
         storage(false),
         storage(false),
-        storage(true),
-        wgpu::BindingType::Texture {
-            sample_type: wgpu::TextureSampleType::Float { filterable: true },
-            view_dimension: wgpu::TextureViewDimension::D3,
-            multisampled: false,
-        },
+        texture(wgpu::TextureViewDimension::D2, false),
+        texture(wgpu::TextureViewDimension::D3, true),
         wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
         wgpu::BindingType::StorageTexture {
             access: wgpu::StorageTextureAccess::WriteOnly,

@@ -29,7 +29,7 @@ use crate::transfer_table::{TransferTable, bins_of, largest};
 use crate::view::{Mode, View};
 
 /// Storage buffers the ray-caster binds.
-const STORAGE_BUFFERS: u64 = 7;
+const STORAGE_BUFFERS: u64 = 6;
 /// Page table blocks made for one report; the others come with the next.
 const TABLES_PER_FRAME: u32 = 64;
 
@@ -277,9 +277,9 @@ impl Renderer {
         let tables: Vec<_> = self
             .channels
             .iter()
-            .map(|(_, table)| table.storage)
+            .map(|(_, table)| table.colors)
             .collect();
-        self.resources.write_transfer(&self.gpu, &tables);
+        self.resources.write_colors(&self.gpu, &tables);
     }
 
     /// Records and submits one frame; never waits. Returns its number.

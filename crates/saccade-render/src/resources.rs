@@ -2,9 +2,10 @@
 
 use glam::{UVec2, UVec3};
 use saccade_core::brick::BRICK_STORED_EDGE;
+use saccade_core::transfer::TABLE_LEN;
 
 use crate::gpu::Gpu;
-use crate::layout::{FrameUniform, MOST_CHANNELS, TransferStorage, Variant, WORKGROUP};
+use crate::layout::{FrameUniform, MOST_CHANNELS, Variant, WORKGROUP};
 use crate::memory::plan::Plan;
 use crate::memory::{Array, Entry};
 use crate::ray_caster::IMAGE_FORMAT;
@@ -21,7 +22,7 @@ pub(crate) struct Resources {
     slot_ranges: wgpu::Buffer,
     missed: wgpu::Buffer,
     report: wgpu::Buffer,
-    transfer: wgpu::Buffer,
+    colors: wgpu::Texture,
     bricks: wgpu::Texture,
     brick_bytes: u32,
     brick_grid: UVec3,
@@ -59,13 +60,7 @@ impl Resources {
         let missed = words("missed", plan.mask_words(), storage | copy_dst);
         let report_usage = storage | copy_dst | wgpu::BufferUsages::COPY_SRC;
         let report = buffer(device, "report", plan.report_bytes(), report_usage);
-        let transfer_bytes = (size_of::<TransferStorage>() * MOST_CHANNELS) as u64;
-        let transfer = buffer(
-            device,
-            "transfer functions",
-            transfer_bytes,
-            storage | copy_dst,
-        );
+        let colors = colors_texture(device);
         let bricks = device.create_texture(&wgpu::TextureDescriptor {
             label: Some("brick cache"),
             size: extent(plan.brick_grid * BRICK_STORED_EDGE),
@@ -91,7 +86,7 @@ impl Resources {
             slot_ranges,
             missed,
             report,
-            transfer,
+            colors,
             bricks,
             brick_bytes: format.block_copy_size(None).unwrap_or(1),
             brick_grid: plan.brick_grid,
@@ -106,6 +101,9 @@ impl Resources {
         let bricks = self
             .bricks
             .create_view(&wgpu::TextureViewDescriptor::default());
+        let colors = self
+            .colors
+            .create_view(&wgpu::TextureViewDescriptor::default());
         let frame = wgpu::BufferBinding {
             buffer: &self.frames,
             offset: 0,
@@ -118,7 +116,7 @@ impl Resources {
             self.slot_ranges.as_entire_binding(),
             self.missed.as_entire_binding(),
             self.report.as_entire_binding(),
-            self.transfer.as_entire_binding(),
+            wgpu::BindingResource::TextureView(&colors),
             wgpu::BindingResource::TextureView(&bricks),
             wgpu::BindingResource::Sampler(&self.sampler),
             wgpu::BindingResource::TextureView(&view),
@@ -138,10 +136,24 @@ impl Resources {
         }
     }
 
-    /// Writes the transfer functions of the channels that are seen, in their order.
-    pub(crate) fn write_transfer(&self, gpu: &Gpu, transfer: &[TransferStorage]) {
+    /// Writes the colours of the channels that are seen, in their order: a row of the texture each.
+    pub(crate) fn write_colors(&self, gpu: &Gpu, colors: &[[[f32; 4]; TABLE_LEN]]) {
+        let rows = u32::try_from(colors.len()).expect("a few channels");
+        if rows == 0 {
+            return;
+        }
+        let layout = wgpu::TexelCopyBufferLayout {
+            offset: 0,
+            bytes_per_row: Some(size_u32::<[[f32; 4]; TABLE_LEN]>()),
+            rows_per_image: None,
+        };
+        let size = wgpu::Extent3d {
+            height: rows,
+            ..self.colors.size()
+        };
+        let texels = bytemuck::cast_slice(colors);
         gpu.queue()
-            .write_buffer(&self.transfer, 0, bytemuck::cast_slice(transfer));
+            .write_texture(self.colors.as_image_copy(), texels, layout, size);
     }
 
     pub(crate) fn write_entries(&self, gpu: &Gpu, array: Array, first: u32, entries: &[Entry]) {
@@ -261,6 +273,21 @@ fn buffer(
         size,
         usage,
         mapped_at_creation: false,
+    })
+}
+
+/// A row of colours per channel. A texture, since drivers that draw on the CPU read a buffer value by value.
+fn colors_texture(device: &wgpu::Device) -> wgpu::Texture {
+    let [width, height] = [TABLE_LEN, MOST_CHANNELS].map(|n| u32::try_from(n).expect("a few"));
+    device.create_texture(&wgpu::TextureDescriptor {
+        label: Some("transfer functions"),
+        size: extent(UVec3::new(width, height, 1)),
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format: wgpu::TextureFormat::Rgba32Float,
+        usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+        view_formats: &[],
     })
 }
 

@@ -1,11 +1,9 @@
 //! From a transfer function to the table that shaders read, and to what it hides.
 
-use bytemuck::Zeroable;
 use saccade_core::transfer::{TABLE_LEN, TransferFunction};
 use saccade_core::volume::{Dtype, Polarity};
 
 use crate::channel::ChannelView;
-use crate::layout::TransferStorage;
 use crate::octree::Bins;
 use crate::view::Mode;
 
@@ -18,7 +16,14 @@ const OPAQUE: f64 = 1e6;
 /// the entries share the range in which the transfer function changes, so that a narrow window is as smooth as a wide one.
 #[derive(Clone, Debug)]
 pub(crate) struct TransferTable {
-    pub(crate) storage: TransferStorage,
+    /// Linear RGB, extinction \[1/nm\].
+    pub(crate) colors: [[f32; 4]; TABLE_LEN],
+    /// Entries below an index that are not transparent.
+    opaque_before: [u32; TABLE_LEN + 1],
+    /// A bit per bin of stored values: whether any is not transparent.
+    pub(crate) visible_bins: u32,
+    /// Stored value of the surface, `[0, 1]`.
+    pub(crate) iso: f32,
     /// Entries per stored value.
     pub(crate) scale: f32,
     /// Entry of stored value 0.
@@ -60,13 +65,15 @@ impl TransferTable {
         };
         let iso = inverted(f64::from(view.iso) * largest);
         let mut table = Self {
-            storage: TransferStorage::zeroed(),
+            colors: [[0.0; 4]; TABLE_LEN],
+            opaque_before: [0; TABLE_LEN + 1],
+            visible_bins: 0,
+            iso: single(iso / largest),
             scale: single(scale),
             offset: single(-first * scale),
             bins: bins_of(view, dtype),
             mode,
         };
-        table.storage.iso = single(iso / largest);
         for index in 0..TABLE_LEN {
             let stored = first + index as f64 / scale;
             // Nothing acquired is nothing seen.
@@ -83,14 +90,14 @@ impl TransferTable {
                 Mode::Maximum => 1.0,
                 Mode::IsoSurface => f64::from(u8::from(stored >= iso)),
             };
-            table.storage.colors[index] = [r, g, b, single(extinction)];
-            let opaque = u32::from(table.storage.colors[index][3] > 0.0);
-            table.storage.opaque_before[index + 1] = table.storage.opaque_before[index] + opaque;
+            table.colors[index] = [r, g, b, single(extinction)];
+            let opaque = u32::from(table.colors[index][3] > 0.0);
+            table.opaque_before[index + 1] = table.opaque_before[index] + opaque;
         }
         for bin in 0..32 {
             let [low, high] = table.bins.values(bin);
             let seen = u32::from(!table.hides(low, high));
-            table.storage.visible_bins |= seen << bin;
+            table.visible_bins |= seen << bin;
         }
         table
     }
@@ -102,8 +109,17 @@ impl TransferTable {
         #[expect(clippy::cast_possible_truncation, reason = "0 to 255")]
         #[expect(clippy::cast_sign_loss, reason = "0 to 255")]
         let [first, last] = [at(low).floor(), at(high).ceil()].map(|at| at as usize);
-        let before = &self.storage.opaque_before;
+        let before = &self.opaque_before;
         high == 0 || before[last + 1] == before[first]
+    }
+
+    /// The first and the last entry that is not transparent; the first is beyond the last where none is.
+    pub(crate) fn opaque_entries(&self) -> [f32; 2] {
+        let opaque = |color: &[f32; 4]| color[3] > 0.0;
+        let first = self.colors.iter().position(opaque);
+        let last = self.colors.iter().rposition(opaque);
+        #[expect(clippy::cast_precision_loss, reason = "a few hundred")]
+        [first.unwrap_or(TABLE_LEN) as f32, last.unwrap_or(0) as f32]
     }
 
     /// Whether no stored value between two is seen, or the largest so far is all that matters and
@@ -184,7 +200,7 @@ mod tests {
             let table = table(&view, Dtype::Uint8);
             assert_eq!((table.scale, table.offset), (1.0, 0.0));
             let want = view.transfer.table();
-            for (got, want) in table.storage.colors.iter().zip(&want) {
+            for (got, want) in table.colors.iter().zip(&want) {
                 assert!((0..3).all(|c| (got[c] - want[c]).abs() < 1e-6));
                 let extinction = -(-want[3]).ln_1p() / 100.0;
                 assert!((got[3] - extinction).abs() <= 1e-6 * extinction);
@@ -208,7 +224,7 @@ mod tests {
                 };
                 let x = (f32::from(stored) * table.scale + table.offset).clamp(0.0, 255.0);
                 let (low, t) = (x.floor().min(254.0), x - x.floor().min(254.0));
-                let [a, b] = [low, low + 1.0].map(|i| table.storage.colors[i as usize][3]);
+                let [a, b] = [low, low + 1.0].map(|i| table.colors[i as usize][3]);
                 let want = extinction(&view.transfer, f64::from(at(f32::from(measured)))) as f32;
                 let got = a + t * (b - a);
                 let off = (got - want).abs();
@@ -226,7 +242,7 @@ mod tests {
         assert!(table.hides(0, 900) && table.hides(5000, 65_535));
         assert!(!table.hides(0, 1100) && !table.hides(1000, 1000) && !table.hides(3000, 65_535));
         // Bins of 128 values each.
-        let seen = table.storage.visible_bins;
+        let seen = table.visible_bins;
         assert_eq!((seen & 0b111_1111, seen >> 8 & 1), (0, 1), "{seen:b}");
     }
 
@@ -236,7 +252,7 @@ mod tests {
             for polarity in [Polarity::Bright, Polarity::Dark] {
                 let view = view(polarity, &[(0.0, 1.0)], [0.0, 1.0]);
                 let table = TransferTable::new(&view, dtype, Mode::IsoSurface);
-                let iso = (table.storage.iso * largest).round() as u16;
+                let iso = (table.iso * largest).round() as u16;
                 let step = (largest / 100.0).ceil() as u16;
                 assert!(table.hides(0, iso - step), "{dtype:?} {polarity:?}");
                 assert!(!table.hides(0, iso + 1) && !table.hides(iso + 1, iso + 1));
@@ -248,16 +264,16 @@ mod tests {
     fn opacity_of_no_length_is_not_infinite() {
         let mut view = view(Polarity::Bright, &[(0.0, 0.5)], [0.0, 1.0]);
         view.transfer.opacity_length_nm = 100.0;
-        let storage = table(&view, Dtype::Uint8).storage;
+        let table_8 = table(&view, Dtype::Uint8);
         assert_eq!(
-            (storage.colors[0][3], storage.opaque_before[TABLE_LEN]),
-            (0.0, 255)
+            (table_8.colors[0][3], table_8.opaque_entries()),
+            (0.0, [1.0, 255.0])
         );
-        assert!((storage.colors[9][3] - 0.5_f32.ln().abs() / 100.0).abs() < 1e-6);
+        assert!((table_8.colors[9][3] - 0.5_f32.ln().abs() / 100.0).abs() < 1e-6);
         for length in [0.0, -1.0, f64::NAN, 1e-300] {
             view.transfer.opacity_length_nm = length;
             for dtype in [Dtype::Uint8, Dtype::Uint16] {
-                let colors = table(&view, dtype).storage.colors;
+                let colors = table(&view, dtype).colors;
                 assert!(colors.iter().flatten().all(|c| c.is_finite()), "{length}");
             }
         }

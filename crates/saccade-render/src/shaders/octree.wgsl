@@ -3,7 +3,8 @@
 // Nodes are words: the block of their eight children, then what is known per channel. What a node
 // says about values holds for some levels only, and it says for which.
 
-@group(0) @binding(6) var<storage, read> transfer: array<Transfer>;
+// Per channel a row: linear RGB and extinction [1/nm] by stored value.
+@group(0) @binding(6) var colors: texture_2d<f32>;
 @group(0) @binding(10) var<storage, read> nodes: array<u32>;
 
 // What is known of the space around a sample, a bit per channel.
@@ -47,15 +48,20 @@ fn cell_at(depth: f32, ray: vec3f) -> vec3u {
     return vec3u(clamp(frame.octree.anchor + vec3i(steps), vec3i(0), last));
 }
 
+// A number per axis, from a byte each.
+fn axes(bytes: u32) -> vec3u {
+    return vec3u(bytes & 255u, (bytes >> 8u) & 255u, bytes >> 16u);
+}
+
 fn child_index(cell: vec3u, depth: u32) -> u32 {
-    let bits = frame.octree.depths[depth].bits;
-    let at = (cell >> frame.octree.depths[depth].shift) & ((vec3u(1u) << bits) - 1u);
+    let bits = axes(frame.octree.depths[depth].bits);
+    let at = (cell >> axes(frame.octree.depths[depth].shift)) & ((vec3u(1u) << bits) - 1u);
     return at.x + (at.y << bits.x) + (at.z << (bits.x + bits.y));
 }
 
 // Depth at which a ray leaves the node of some depth that a cell is in.
 fn leaving_node(cell: vec3u, depth: u32, ray: vec3f) -> f32 {
-    let shift = frame.octree.depths[depth].shift;
+    let shift = axes(frame.octree.depths[depth].shift);
     let first = vec3i((cell >> shift) << shift) - frame.octree.anchor;
     let low = vec3f(first);
     let high = low + vec3f(vec3u(1u) << shift);
@@ -73,9 +79,10 @@ fn is_range_hidden(channel: u32, low: u32, high: u32) -> bool {
     if MODE == MODE_MAXIMUM {
         return f32(high) <= largest_seen[channel] * frame.largest;
     }
-    let first = u32(table_position(channel, f32(low)));
-    let last = u32(ceil(table_position(channel, f32(high))));
-    return high == 0u || transfer[channel].opaque_before[last + 1u] == transfer[channel].opaque_before[first];
+    let first = floor(table_position(channel, f32(low)));
+    let last = ceil(table_position(channel, f32(high)));
+    let here = frame.channels[channel];
+    return high == 0u || last < here.first_opaque || first > here.last_opaque;
 }
 
 // The largest node around a sample in which each channel is hidden, all alike or nearly all seen, else the
@@ -95,7 +102,7 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
     if level == path_level {
         at = path_depth;
         let moved = cell ^ path_cell;
-        while at > 0u && any((moved >> frame.octree.depths[at].shift) != vec3u(0u)) {
+        while at > 0u && any((moved >> axes(frame.octree.depths[at].shift)) != vec3u(0u)) {
             at -= 1u;
         }
         is_new = at == path_depth;
@@ -138,7 +145,7 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
                 let low = range & 0xffffu;
                 let high = range >> 16u;
                 let bins = nodes[known + NODE_BINS];
-                let visible = countOneBits(bins & transfer[c].visible_bins);
+                let visible = countOneBits(bins & frame.channels[c].visible_bins);
                 if visible == 0u || is_range_hidden(c, low, high) {
                     hidden |= bit;
                 } else if low == high {

@@ -62,7 +62,9 @@ fn is_transparent(channel: u32, slot: u32) -> bool {
 fn color_of(channel: u32, stored: f32) -> vec4f {
     let x = table_position(channel, stored * frame.largest);
     let i = min(u32(x), TABLE_LEN - 2u);
-    let color = mix(transfer[channel].colors[i], transfer[channel].colors[i + 1u], x - f32(i));
+    let low = textureLoad(colors, vec2u(i, channel), 0);
+    let high = textureLoad(colors, vec2u(i + 1u, channel), 0);
+    let color = mix(low, high, x - f32(i));
     return select(vec4f(0.0), color, stored > 0.0);
 }
 
@@ -274,7 +276,7 @@ fn lit_surface(ray: vec3f) -> vec3f {
     let facing = abs(dot(gradient, ray)) / max(length(gradient) * length(ray), 1e-30);
     // Where values do not change there is no surface to light: as if it faced the eye.
     let diffuse = select(facing, 1.0, length(gradient) <= 1e-30);
-    return color_of(surface, transfer[surface].iso).rgb * (0.15 + 0.85 * diffuse);
+    return color_of(surface, frame.channels[surface].iso).rgb * (0.15 + 0.85 * diffuse);
 }
 
 // Loops, from the outside: look-ups that find no brick at once; stretches of one level and step; regions with
@@ -450,7 +452,7 @@ fn trace(pixel: vec2u) -> vec3f {
                         if MODE == MODE_MAXIMUM {
                             largest_seen[c] = max(largest_seen[c], stored);
                         } else if MODE == MODE_ISO_SURFACE {
-                            let iso = transfer[c].iso;
+                            let iso = frame.channels[c].iso;
                             if stored >= iso {
                                 let rise = stored - sample_before[c];
                                 let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);

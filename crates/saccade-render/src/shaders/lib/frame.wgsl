@@ -14,9 +14,9 @@ struct Level {
 
 // Nodes of one depth of the residency octree; the root's depth is 0.
 struct Depth {
-    shift: vec3u,   // edge of a node [log2 of cells]
-    residency: u32, // levels whose bricks are noted at this depth, as bits
-    bits: vec3u,    // how often each axis was halved since the depth above
+    shift: u32,              // edge of a node [log2 of cells], a byte per axis
+    bits: u32,               // how often each axis was halved since the depth above, a byte per axis
+    @size(8) residency: u32, // levels whose bricks are noted at this depth, as bits
 }
 
 // The residency octree as seen from the eye, in cells from the low corner of the anchor cell.
@@ -26,7 +26,7 @@ struct Octree {
     anchor: vec3i,       // cell near the eye
     cells_per_nm: vec3f,
     cells: vec3u,        // cells that the volume touches, per axis
-    depths: array<Depth, MOST_DEPTHS>,
+    @align(16) depths: array<Depth, MOST_DEPTHS>,
 }
 
 // A channel that is seen.
@@ -39,6 +39,10 @@ struct Channel {
     flags: u32,            // CHANNEL_: what the octree says of it holds
     table_scale: f32,      // to entries of the colour table from stored values
     table_offset: f32,
+    first_opaque: f32,     // entries from here to
+    last_opaque: f32,      // here may be seen, all others are transparent
+    visible_bins: u32,     // a bit per bin of stored values: any that is not transparent
+    iso: f32,              // stored value of the surface [0, 1]
 }
 
 struct Frame {
@@ -67,12 +71,4 @@ struct Frame {
     octree: Octree,
     channels: array<Channel, MOST_CHANNELS>,
     planes: array<vec4f, MOST_PLANES>, // what is seen has dot(xyz, position from the eye [nm]) + w >= 0
-}
-
-// Colours of a channel by stored value, and which values are seen at all.
-struct Transfer {
-    colors: array<vec4f, TABLE_LEN>,       // linear RGB, extinction [1/nm]
-    opaque_before: array<u32, 257>,        // entries below that are not transparent
-    visible_bins: u32,                     // a bit per bin of stored values: any that is not transparent
-    iso: f32,                              // stored value of the surface [0, 1]
 }
