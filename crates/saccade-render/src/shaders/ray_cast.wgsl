@@ -116,6 +116,10 @@ var<private> first_texel: array<vec3f, SLOTS>;
 var<private> texels_per_depth: array<vec3f, SLOTS>;
 var<private> low_texel: array<vec3f, SLOTS>;
 var<private> texel: vec3f;
+// The same of the bricks after it, where one channel is seen, and with which samples they begin.
+var<private> next_texel: array<vec3f, 2>;
+var<private> next_low: array<vec3f, 2>;
+var<private> turns: vec2f;
 // The sample before, of surfaces [0, 1].
 var<private> sample_before: array<f32, SLOTS>;
 
@@ -204,8 +208,8 @@ fn look_further(channel: u32, depth: f32, ray: vec3f, urgency: f32) {
     draw_from(channel, here);
 }
 
-// Where samples from `depth` on lie in the brick cache.
-fn aim(channel: u32, depth: f32, ray: vec3f) {
+// Lowest corner of the brick that is drawn [texels].
+fn corner_of(channel: u32) -> vec3f {
     let here = drawn[channel];
     // Whole numbers below 2^22: exact, and quicker than dividing integers.
     let grid = vec3f(frame.brick_grid);
@@ -213,11 +217,40 @@ fn aim(channel: u32, depth: f32, ray: vec3f) {
     let row = floor(slot / grid.x);
     let layer = floor(slot / (grid.x * grid.y));
     let cell = vec3f(floor(slot) - row * grid.x, row - layer * grid.y, layer);
-    let corner = cell * f32(BRICK_STORED_EDGE) + f32(BRICK_BORDER);
+    return cell * f32(BRICK_STORED_EDGE) + f32(BRICK_BORDER);
+}
+
+// Where samples from `depth` on lie in the brick cache.
+fn aim(channel: u32, depth: f32, ray: vec3f) {
+    let here = drawn[channel];
+    let corner = corner_of(channel);
     let voxels = ray * frame.levels[here.level].voxels_per_nm;
     low_texel[channel] = corner * texel;
     first_texel[channel] = (corner + frame.levels[here.level].eye - here.place.low + depth * voxels) * texel;
     texels_per_depth[channel] = voxels * texel;
+}
+
+// Where samples lie in one brick of a row, the first of the row at `depth`, and with which sample it begins.
+fn aim_in_row(index: u32, turn: f32, depth: f32, ray: vec3f) {
+    let here = drawn[0];
+    let corner = corner_of(0u);
+    let voxels = ray * frame.levels[here.level].voxels_per_nm;
+    let low = corner * texel;
+    let first = (corner + frame.levels[here.level].eye - here.place.low + depth * voxels) * texel;
+    if index == 0u {
+        low_texel[0] = low;
+        first_texel[0] = first;
+        texels_per_depth[0] = voxels * texel;
+        turns = vec2f(3e38);
+    } else if index == 1u {
+        next_low[0] = low;
+        next_texel[0] = first;
+        turns.x = turn;
+    } else {
+        next_low[1] = low;
+        next_texel[1] = first;
+        turns.y = turn;
+    }
 }
 
 // The stored value at a place in the brick cache, as the sampler counts, from 0 to 1.
@@ -392,35 +425,77 @@ fn trace(pixel: vec2u) -> vec3f {
             loop {
                 let first = min(step, depths.y - start);
                 depth = start + sample_at * first;
-                var until = stretch + sample_at * step;
                 lost = 0u;
-                for (var c = 0u; c < channel_count(); c += 1u) {
-                    let bit = 1u << c;
-                    if (hidden & bit) != 0u {
-                        until = min(until, around);
-                        sample_before[c] = 0.0;
-                        continue;
-                    }
-                    let wanted = channel_level(c, level);
-                    let holds = wanted == drawn_for[c] && depth < drawn[c].leaving;
-                    if !holds && (found & bit) == 0u {
-                        if !look_up(c, wanted, depth, ray) {
-                            lost |= bit;
+                var count = 0u;
+                var sampled = 0u;
+                var forgets = false;
+                if SLOTS == 1u {
+                    // Several bricks in a row: rays that are drawn at once wait for each other at its end, and no
+                    // longer at the end of each brick. Surfaces end rays too soon for that.
+                    let wanted = channel_level(0u, level);
+                    let most = stretch + sample_at * step;
+                    for (var index = 0u; index < select(3u, 1u, MODE == MODE_ISO_SURFACE); index += 1u) {
+                        let from_ = start + f32(count) * step;
+                        let next = from_ + sample_at * min(step, depths.y - from_);
+                        let holds = wanted == drawn_for[0] && next < drawn[0].leaving;
+                        let before = vec2u(missing, transparent);
+                        if !holds && found == 0u && !look_up(0u, wanted, next, ray) {
+                            if index == 0u {
+                                lost = 1u;
+                            } else {
+                                // The next row begins with it.
+                                forgets = true;
+                                missing = before.x;
+                                transparent = before.y;
+                            }
+                            break;
+                        }
+                        found = 0u;
+                        if transparent != 0u {
+                            // Where nothing of a brick is seen, it is passed as a whole.
+                            if index == 0u {
+                                count = segments_until(min(most, drawn[0].leaving), next, step);
+                            }
+                            break;
+                        }
+                        aim_in_row(index, f32(count), depth, ray);
+                        sampled = 1u;
+                        count += segments_until(min(min(most, around), drawn[0].leaving), next, step);
+                        let end = start + f32(count) * step;
+                        let last = end + sample_at * min(step, depths.y - end);
+                        if drawn[0].level != wanted || end >= stretch || last >= around || segments + count >= doubling {
+                            break;
                         }
                     }
-                    // Where nothing of a brick is seen, it is passed as a whole.
-                    until = min(until, drawn[c].leaving);
-                    if (transparent & bit) == 0u {
-                        until = min(until, around);
+                } else {
+                    var until = stretch + sample_at * step;
+                    for (var c = 0u; c < channel_count(); c += 1u) {
+                        let bit = 1u << c;
+                        if (hidden & bit) != 0u {
+                            until = min(until, around);
+                            sample_before[c] = 0.0;
+                            continue;
+                        }
+                        let wanted = channel_level(c, level);
+                        let holds = wanted == drawn_for[c] && depth < drawn[c].leaving;
+                        if !holds && (found & bit) == 0u {
+                            if !look_up(c, wanted, depth, ray) {
+                                lost |= bit;
+                            }
+                        }
+                        // Where nothing of a brick is seen, it is passed as a whole.
+                        until = min(until, drawn[c].leaving);
+                        if (transparent & bit) == 0u {
+                            until = min(until, around);
+                        }
                     }
+                    found = select(0u, found, lost != 0u);
+                    count = segments_until(until, depth, step);
+                    sampled = everything & ~hidden & ~transparent;
                 }
                 if lost != 0u {
                     break;
                 }
-                found = 0u;
-                let count = segments_until(until, depth, step);
-
-                let sampled = everything & ~hidden & ~transparent;
                 for (var c = 0u; c < channel_count(); c += 1u) {
                     let bit = 1u << c;
                     if (hidden & bit) == 0u && drawn[c].found.entry >= FIRST_SLOT {
@@ -431,7 +506,9 @@ fn trace(pixel: vec2u) -> vec3f {
                         }
                     }
                     if (sampled & bit) != 0u {
-                        aim(c, depth, ray);
+                        if SLOTS > 1u {
+                            aim(c, depth, ray);
+                        }
                     } else {
                         sample_before[c] = 0.0;
                     }
@@ -486,6 +563,13 @@ fn trace(pixel: vec2u) -> vec3f {
                     }
                     i += 1.0;
                     left -= 1u;
+                    if SLOTS == 1u && i >= turns.x {
+                        first_texel[0] = next_texel[0];
+                        low_texel[0] = next_low[0];
+                        next_texel[0] = next_texel[1];
+                        next_low[0] = next_low[1];
+                        turns = vec2f(turns.y, 3e38);
+                    }
                 }
                 samples -= left * countOneBits(sampled);
                 if (missing & ~hidden) != 0u && false_colors {
@@ -497,6 +581,9 @@ fn trace(pixel: vec2u) -> vec3f {
                 }
                 start += f32(count) * step;
                 segments += count;
+                if forgets {
+                    drawn_for[0] = MAX_LEVELS;
+                }
                 depth = start + sample_at * min(step, depths.y - start);
                 if depth >= around || start >= stretch || segments >= doubling || transmitted <= TERMINATION {
                     break;
