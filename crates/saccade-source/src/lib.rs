@@ -1,7 +1,7 @@
 //! Where voxels come from.
 //!
 //! A [`VolumeSource`] describes a volume and delivers its chunks on demand: stitched from the tiles
-//! of an archive ([`stitched`]), from an OME-Zarr image ([`zarr`]), an array in memory ([`memory`]), or a Saccade server
+//! of an archive ([`stitched`]), from an OME-Zarr image ([`zarr`]) or a precomputed volume ([`precomputed`]), an array in memory ([`memory`]), or a Saccade server
 //! ([`remote`]). What a source cannot do is wait for the eye: everything above asks for chunks it
 //! needs now, in the order of need, and drops the requests it no longer needs.
 //!
@@ -21,15 +21,25 @@
 //! It knows nothing of bricks, borders, GPUs or views.
 
 mod changes;
+mod codecs;
 pub mod conformance;
+mod flights;
+pub mod images;
 pub mod maybe_send;
 pub mod memory;
+pub mod objects;
+pub mod precomputed;
 pub mod remote;
 mod source;
 #[cfg(not(target_family = "wasm"))]
 pub mod stitched;
-#[cfg(not(target_family = "wasm"))]
+mod stored;
+#[cfg(all(test, not(target_family = "wasm")))]
+mod test_server;
+mod values;
 pub mod zarr;
+
+pub use stored::PieceError;
 
 pub use source::{
     Change, ChangeReason, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource,

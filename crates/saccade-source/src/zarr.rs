@@ -1,180 +1,251 @@
-//! OME-Zarr images, versions 0.1 to 0.5, in a folder.
+//! OME-Zarr images, versions 0.1 to 0.5 and what of 0.6 has the same meaning, wherever [`crate::objects`] reach.
 //!
-//! The arrays may be of Zarr version 2 or 3, sharded or not, of any codec that `zarrs` knows; their axes
-//! any of t, c, z, y, x in any order. Levels may be of any ratio to the finest. Of several times the
-//! first is shown.
+//! The arrays may be of Zarr version 2 or 3, sharded or not, compressed by blosc, zstd, gzip, zlib or lz4;
+//! their axes any of t, c, z, y, x in any order. Levels may be of any ratio to the finest. Of several times
+//! the first is shown.
 //!
 //! # Values
 //!
 //! Unsigned integers of 8 and 16 bit are what they are. Signed ones are moved up by half their range, so that
-//! their order stays. Other types are refused in words: what they would lose, nobody would see. A
-//! value of 0 counts as nothing measured, as everywhere.
+//! their order stays. Wider numbers are shown in 16 bit: whole ones as they are if those of the coarsest
+//! level fit, others within a window that [`ZarrSource::notes`] tells. A value of 0 counts as nothing
+//! measured, as everywhere.
+//!
+//! # Reading
+//!
+//! A shard's index is read once; chunks that are wanted together and lie close together come with one
+//! request. What is not stored has the array's fill value.
 //!
 //! # Failure
 //!
-//! What is in files is believed nothing: absurd shapes and chunks are refused before memory is taken. A
-//! chunk that cannot be decoded is [`ChunkError::Failed`] and names the array; the others are not
-//! affected.
+//! What others wrote is believed nothing: absurd shapes and chunks are refused before memory is taken. A
+//! chunk that cannot be decoded is read once more where it came over a network; then it is
+//! [`ChunkError::Failed`] with a [`PieceError`](crate::PieceError) that names it and where it is. The others are not affected.
 
 mod array;
 mod error;
+mod image;
 mod metadata;
-#[cfg(test)]
+mod shard;
+#[cfg(all(test, not(target_family = "wasm")))]
 mod tests;
 
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use bytes::Bytes;
+use futures::future::join_all;
 use glam::{DVec3, UVec3};
 use saccade_core::brick::MAX_LEVELS;
 use saccade_core::levels::Level;
-use saccade_core::volume::{MAX_EXTENT, Volume};
-use saccade_core::voxel_box::VoxelBox;
-use tokio::sync::Semaphore;
+use saccade_core::volume::{Dtype, MAX_EXTENT, Volume};
+use serde_json::Value;
 
 use crate::maybe_send::{BoxFuture, BoxStream};
+use crate::objects::{Objects, Part};
+use crate::stored::{StoredSource, volume_name};
 use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
-use array::LevelArray;
+use array::Array;
+use error::Refusal;
 pub use error::ZarrError;
+use image::{LevelArray, ZarrImage};
 use metadata::Image;
 
 /// Size of the chunks that a volume is read in \[voxels\]: some bricks, whatever the file's own are.
 const CHUNK: UVec3 = UVec3::new(64, 64, 64);
-/// Decoded chunks of the files that are kept, all levels together \[bytes\].
-const CACHE_BYTES: u64 = 512 << 20;
+/// Metadata longer than this are not read \[bytes\].
+const MOST_METADATA: u64 = 16 << 20;
 
-/// An OME-Zarr image in a folder.
-#[derive(Debug)]
+/// An OME-Zarr image.
 pub struct ZarrSource {
-    volume: Arc<Volume>,
-    levels: Arc<[LevelArray]>,
-    /// As many decode at once as there are processors: more would only fill memory.
-    decoders: Arc<Semaphore>,
+    stored: StoredSource<ZarrImage>,
+    notes: Vec<String>,
+}
+
+impl std::fmt::Debug for ZarrSource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ZarrSource")
+            .field("volume", self.volume())
+            .finish_non_exhaustive()
+    }
 }
 
 impl ZarrSource {
     /// Whether a folder is the root of an OME-Zarr image or of another Zarr group.
-    pub fn is_zarr(folder: &Path) -> bool {
+    #[cfg(not(target_family = "wasm"))]
+    pub fn is_zarr(folder: &std::path::Path) -> bool {
         ["zarr.json", ".zattrs", ".zgroup", ".zarray"]
             .iter()
             .any(|name| folder.join(name).is_file())
     }
 
-    /// Opens an image. Reads metadata only.
+    /// Opens the image in a folder. Reads metadata, and voxels only if values must be fitted into 16 bit.
     ///
     /// # Errors
     ///
     /// [`SourceError::Open`] with a [`ZarrError`].
-    pub async fn open(folder: &Path) -> Result<Self, SourceError> {
-        let path = folder.to_owned();
-        let opened = tokio::task::spawn_blocking(move || Self::open_now(&path)).await;
-        let opened = opened.unwrap_or_else(|panic| Err(ZarrError::interrupted(folder, &panic)));
+    #[cfg(not(target_family = "wasm"))]
+    pub async fn open_folder(folder: &std::path::Path) -> Result<Self, SourceError> {
+        let name = folder.file_name().unwrap_or_default().to_string_lossy();
+        let objects = Arc::new(crate::objects::FolderObjects::new(folder));
+        let opened = Self::open(objects, &name).await;
         opened.map_err(|error| SourceError::Open {
             source: Arc::new(error),
             location: folder.display().to_string(),
         })
     }
 
-    fn open_now(folder: &Path) -> Result<Self, ZarrError> {
-        let image = Image::read(folder)?;
-        let cache = CACHE_BYTES / image.datasets.len().max(1) as u64;
-        let open = |dataset: &metadata::Dataset| {
-            LevelArray::open(&folder.join(&dataset.path), &image.axes, cache)
-        };
-        let levels: Vec<LevelArray> = image.datasets.iter().map(open).collect::<Result<_, _>>()?;
-        let volume = volume(folder, &image, &levels)?;
-        let cores = std::thread::available_parallelism().map_or(2, usize::from);
+    /// Opens the image that some objects are; its name is made from `name`.
+    ///
+    /// # Errors
+    ///
+    /// [`ZarrError::NoImage`] if they are none, others as they occur.
+    pub async fn open(objects: Arc<dyn Objects>, name: &str) -> Result<Self, ZarrError> {
+        let attributes = attributes(&*objects, "").await?;
+        let attributes = attributes.ok_or_else(|| ZarrError::NoImage {
+            location: objects.location(""),
+        })?;
+        let ome = metadata::ome(&attributes);
+        let here = |refusal: Refusal| refusal.at(objects.location(""));
+        let paths = metadata::paths(ome).map_err(here)?;
+        let arrays = join_all(paths.iter().map(|path| array_of(&*objects, path))).await;
+        let arrays: Vec<Array> = arrays.into_iter().collect::<Result<_, _>>()?;
+        let rank = arrays.first().map_or(0, |array| array.shape.len());
+        let image = Image::parse(ome, rank).map_err(here)?;
+        let levels = arrays.into_iter().zip(&paths).map(|(array, path)| {
+            let level = LevelArray::new(path, array, &image.axes);
+            level.map_err(|refusal| refusal.at(objects.location(path)))
+        });
+        let levels: Vec<LevelArray> = levels.collect::<Result<_, _>>()?;
+        let volume = volume(name, &image, &levels).map_err(here)?;
+        let mut notes = Vec::new();
+        if !image.has_size {
+            notes.push("the image does not say how large its voxels are; they are taken for 1 micrometer where it does not".to_owned());
+        }
+        let labels = labels(&*objects).await;
+        if !labels.is_empty() {
+            let first = &labels[0];
+            let all = labels.join(", ");
+            notes.push(format!("it has labels, which are images of their own: {all}; open one as IMAGE/labels/{first}"));
+        }
+        let stored = ZarrImage::new(objects, volume, levels, &image).await?;
+        notes.extend(stored.values().note());
+        let piece = stored.piece_bytes();
         Ok(Self {
-            volume: Arc::new(volume),
-            levels: levels.into(),
-            decoders: Arc::new(Semaphore::new(cores)),
+            stored: StoredSource::new(stored, piece),
+            notes,
         })
     }
 
-    async fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
-        let Some(voxels) = id.voxels(&self.volume) else {
-            return Err(ChunkError::OutOfRange { id });
-        };
-        // The semaphore is never closed.
-        let permit = self.decoders.clone().acquire_owned().await.ok();
-        let (levels, size) = (self.levels.clone(), self.volume.chunk);
-        let read = tokio::task::spawn_blocking(move || {
-            let _permit = permit;
-            let array = &levels[id.level as usize];
-            array.read(id.channel, voxels, size)
-        });
-        let read = read.await.unwrap_or_else(|panic| {
-            let path = self.levels[id.level as usize].path();
-            Err(ZarrError::interrupted(path, &panic))
-        });
-        match read {
-            Ok(voxels) if voxels.iter().all(|&byte| byte == 0) => Ok(Chunk::Empty),
-            Ok(voxels) => Ok(Chunk::Voxels(Bytes::from(voxels))),
-            Err(error) => Err(ChunkError::Failed {
-                id,
-                transient: error.is_transient(),
-                source: Arc::new(error),
-            }),
-        }
+    /// What a user should know of how the image is shown, in sentences.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 }
 
 impl VolumeSource for ZarrSource {
     fn volume(&self) -> &Arc<Volume> {
-        &self.volume
+        self.stored.volume()
     }
 
     fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
-        Box::pin(self.chunk(id))
+        self.stored.read(id)
     }
 
-    /// Nobody tells of changes in files.
     fn changes(&self) -> BoxStream<'static, Change> {
-        Box::pin(futures::stream::pending())
+        self.stored.changes()
     }
 }
 
+/// The JSON of an object; `None` if there is none.
+async fn json(objects: &dyn Objects, key: &str) -> Result<Option<Value>, ZarrError> {
+    let most = MOST_METADATA;
+    let Some(text) = objects.read(key, Part::Whole { most }).await? else {
+        return Ok(None);
+    };
+    let value = serde_json::from_slice(&text);
+    let value = value.map_err(|error| Refusal::wrong(error).at(objects.location(key)))?;
+    Ok(Some(value))
+}
+
+fn below(folder: &str, name: &str) -> String {
+    match folder {
+        "" => name.to_owned(),
+        folder => format!("{folder}/{name}"),
+    }
+}
+
+/// The attributes of a group, whatever its version; `None` if there is none.
+async fn attributes(objects: &dyn Objects, folder: &str) -> Result<Option<Value>, ZarrError> {
+    if let Some(mut group) = json(objects, &below(folder, "zarr.json")).await? {
+        return Ok(Some(group["attributes"].take()));
+    }
+    json(objects, &below(folder, ".zattrs")).await
+}
+
+/// An array's metadata, of either version.
+async fn array_of(objects: &dyn Objects, path: &str) -> Result<Array, ZarrError> {
+    let array = if let Some(json) = json(objects, &below(path, "zarr.json")).await? {
+        Array::version_3(&json)
+    } else if let Some(json) = json(objects, &below(path, ".zarray")).await? {
+        Array::version_2(&json)
+    } else {
+        Err(Refusal::wrong("a level is listed, but is no array"))
+    };
+    array.map_err(|refusal| refusal.at(objects.location(path)))
+}
+
+/// Names of an image's labels. That they cannot be read is no reason not to show the image.
+async fn labels(objects: &dyn Objects) -> Vec<String> {
+    let Ok(Some(group)) = attributes(objects, "labels").await else {
+        return Vec::new();
+    };
+    let names = metadata::ome(&group)["labels"]
+        .as_array()
+        .into_iter()
+        .flatten();
+    names
+        .filter_map(Value::as_str)
+        .take(20)
+        .map(str::to_owned)
+        .collect()
+}
+
 /// The volume that an image is.
-fn volume(folder: &Path, image: &Image, levels: &[LevelArray]) -> Result<Volume, ZarrError> {
-    let refused = |reason: String| ZarrError::Unsupported {
-        reason,
-        path: folder.to_owned(),
-    };
-    let Some(finest) = levels.first() else {
-        return Err(refused("it has no levels".to_owned()));
-    };
-    let voxel_nm = image.voxel_nm;
-    let volume = Volume::new(&name(folder), finest.extent(), voxel_nm);
-    let mut volume = volume.map_err(|error| refused(error.to_string()))?;
+fn volume(name: &str, image: &Image, levels: &[LevelArray]) -> Result<Volume, Refusal> {
+    let refused = |reason: &str| Refusal::Unsupported(reason.to_owned());
+    let finest = levels.first().ok_or_else(|| refused("it has no levels"))?;
+    let volume = Volume::new(&volume_name(name), finest.extent(), image.voxel_nm);
+    let mut volume = volume.map_err(|error| refused(&error.to_string()))?;
     if levels.len() > MAX_LEVELS {
         let count = levels.len();
-        return Err(refused(format!(
+        return Err(refused(&format!(
             "it has {count} levels, and {MAX_LEVELS} can be shown"
         )));
     }
-    volume.dtype = finest.dtype();
+    volume.dtype = match finest.number().bytes() {
+        1 => Dtype::Uint8,
+        _ => Dtype::Uint16,
+    };
     volume.chunk = CHUNK;
     volume.channels = (0..finest.channels())
         .map(|index| match image.channels.get(index as usize) {
-            Some(label) if !label.is_empty() => label.clone(),
+            Some(channel) if !channel.label.is_empty() => channel.label.clone(),
             _ => format!("channel {index}"),
         })
         .collect();
     volume.levels.clear();
-    for (level, dataset) in levels.iter().zip(&image.datasets) {
-        if level.dtype() != finest.dtype() || level.channels() != finest.channels() {
-            return Err(refused("its levels differ in type or channels".to_owned()));
+    for (level, downsampling) in levels.iter().zip(&image.downsampling) {
+        if level.number() != finest.number() || level.channels() != finest.channels() {
+            return Err(refused("its levels differ in type or channels"));
         }
         if level.extent().max_element() > MAX_EXTENT {
             let extent = level.extent();
-            return Err(refused(format!(
+            return Err(refused(&format!(
                 "{extent} voxels are more than {MAX_EXTENT} along an axis"
             )));
         }
         // What the transformations say, or, where they say nothing, what the sizes do.
         let by_size = finest.extent().as_dvec3() / level.extent().as_dvec3();
-        let downsampling = dataset.downsampling.unwrap_or(by_size);
+        let downsampling = downsampling.unwrap_or(by_size);
         volume.levels.push(Level {
             extent: level.extent(),
             downsampling: downsampling.max(DVec3::ONE),
@@ -185,36 +256,7 @@ fn volume(folder: &Path, image: &Image, levels: &[LevelArray]) -> Result<Volume,
             && pair[1].extent.cmple(pair[0].extent).all()
     });
     if !coarser {
-        return Err(refused("its levels are not from fine to coarse".to_owned()));
+        return Err(refused("its levels are not from fine to coarse"));
     }
     Ok(volume)
 }
-
-/// A name for addresses, from the folder's.
-fn name(folder: &Path) -> String {
-    let name = folder.file_name().unwrap_or_default().to_string_lossy();
-    let name = name.trim_end_matches(".zarr").trim_end_matches(".ome");
-    let allowed = |c: char| {
-        if c.is_ascii_alphanumeric() || "-_.".contains(c) {
-            c
-        } else {
-            '-'
-        }
-    };
-    let name: String = name.chars().map(allowed).take(100).collect();
-    match name.trim_start_matches('.') {
-        "" => "image".to_owned(),
-        name => name.to_owned(),
-    }
-}
-
-/// A chunk of `size` voxels of some `bytes`, all 0, with its width and height \[voxels\]; `inside` is the part
-/// that lies in the volume.
-fn padded(size: UVec3, inside: VoxelBox, bytes: usize) -> (Vec<u8>, usize, usize) {
-    let [width, height, depth] = size.to_array().map(|edge| edge as usize);
-    debug_assert!(inside.size().cmple(size).all(), "a part of the chunk");
-    (vec![0; width * height * depth * bytes], width, height)
-}
-
-/// Where an array is, for messages.
-type ArrayPath = PathBuf;

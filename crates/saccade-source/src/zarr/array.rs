@@ -1,275 +1,472 @@
-//! One level: an array of a few axes, read as boxes of voxels.
+//! What the metadata of an array say: its shape, its chunks, and how they are encoded.
 
-use std::ops::Range;
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use serde_json::Value;
 
-use glam::UVec3;
-use saccade_core::volume::Dtype;
-use saccade_core::voxel_box::VoxelBox;
-use zarrs::array::chunk_cache::{ChunkCache, ChunkCacheDecodedLruSizeLimit};
-use zarrs::array::{Array, CodecOptions};
-use zarrs::filesystem::FilesystemStore;
-use zarrs::storage::ReadableStorageTraits;
+use super::error::Refusal;
+use crate::codecs::Codec;
+use crate::values::Number;
 
-use super::metadata::{Axis, json};
-use super::{ZarrError, padded};
-
-/// Chunks of a file that are larger than this when decoded are refused \[bytes\].
+/// Chunks that are larger than this when decoded are refused \[bytes\].
 const MOST_CHUNK: u64 = 1 << 30;
+/// Chunks that a shard may have: its index must be read before any of them.
+const MOST_IN_SHARD: u64 = 1 << 22;
 
-/// How values are stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Stored {
-    Uint8,
-    Int8,
-    Uint16,
-    Int16,
+/// How numbers become the bytes of a chunk.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Encoding {
+    /// Axes of the array in the order in which a chunk has them, slowest first.
+    pub(super) order: Vec<usize>,
+    pub(super) big_endian: bool,
+    /// In the order in which they were applied.
+    pub(super) codecs: Vec<Codec>,
 }
 
-/// What an array's metadata say.
-#[derive(Debug)]
-pub(super) struct Metadata {
+/// How chunks lie in shards.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Sharding {
+    /// Chunks per shard, by axis.
+    pub(super) chunks: Vec<u64>,
+    pub(super) index_at_start: bool,
+    pub(super) index_big_endian: bool,
+    pub(super) index_checked: bool,
+}
+
+impl Sharding {
+    /// Chunks per shard.
+    pub(super) fn count(&self) -> u64 {
+        self.chunks.iter().product()
+    }
+
+    /// Bytes of its index.
+    pub(super) fn index_bytes(&self) -> u64 {
+        self.count() * 16 + if self.index_checked { 4 } else { 0 }
+    }
+}
+
+/// How a chunk's numbers become its key.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Keys {
+    /// `c` comes first.
+    prefixed: bool,
+    separator: char,
+}
+
+impl Keys {
+    pub(super) fn key(&self, chunk: &[u64]) -> String {
+        let mut key = String::new();
+        if self.prefixed {
+            key.push('c');
+        }
+        for number in chunk {
+            if !key.is_empty() {
+                key.push(self.separator);
+            }
+            key += &number.to_string();
+        }
+        key
+    }
+}
+
+/// An array.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Array {
     /// Slowest axis first.
     pub(super) shape: Vec<u64>,
     /// Of what is decoded in one piece.
-    chunk: Vec<u64>,
-    dtype: String,
+    pub(super) chunk: Vec<u64>,
+    pub(super) number: Number,
+    pub(super) encoding: Encoding,
+    pub(super) sharding: Option<Sharding>,
+    pub(super) keys: Keys,
+    /// A number as it is stored, for chunks that are not.
+    pub(super) fill: Vec<u8>,
 }
 
-impl Metadata {
-    /// Reads them, of either version.
-    pub(super) fn read(folder: &Path) -> Result<Self, ZarrError> {
-        let wrong = |reason: &str| ZarrError::Metadata {
-            reason: reason.to_owned(),
-            path: folder.to_owned(),
-        };
-        let numbers = |value: &serde_json::Value| -> Option<Vec<u64>> {
-            value
-                .as_array()?
-                .iter()
-                .map(serde_json::Value::as_u64)
-                .collect()
-        };
-        let (shape, chunk, dtype) = if let Some(array) = json(&folder.join("zarr.json"))? {
-            let chunk = &array["chunk_grid"]["configuration"]["chunk_shape"];
-            let sharding = array["codecs"].as_array().into_iter().flatten();
-            let inner = sharding
-                .filter(|codec| codec["name"] == "sharding_indexed")
-                .find_map(|codec| numbers(&codec["configuration"]["chunk_shape"]));
-            let chunk = inner.or_else(|| numbers(chunk));
-            (numbers(&array["shape"]), chunk, array["data_type"].clone())
-        } else if let Some(array) = json(&folder.join(".zarray"))? {
-            let (shape, chunk) = (numbers(&array["shape"]), numbers(&array["chunks"]));
-            (shape, chunk, array["dtype"].clone())
-        } else {
-            return Err(wrong("a level is listed, but is no array"));
-        };
-        let dtype = match dtype.as_str() {
-            Some(name) => name.to_owned(),
-            None => dtype.to_string(),
-        };
-        let shape = shape.ok_or_else(|| wrong("it has no shape"))?;
-        let chunk = chunk.ok_or_else(|| wrong("it has no chunk shape"))?;
-        if shape.len() != chunk.len() || shape.contains(&0) || chunk.contains(&0) {
-            return Err(wrong("its shape and that of its chunks do not fit"));
+fn numbers(value: &Value) -> Option<Vec<u64>> {
+    value.as_array()?.iter().map(Value::as_u64).collect()
+}
+
+impl Array {
+    /// Bytes of a chunk when it is decoded.
+    pub(super) fn chunk_bytes(&self) -> usize {
+        let count: u64 = self.chunk.iter().product();
+        usize::try_from(count).expect("checked when it was read") * self.number.bytes()
+    }
+
+    /// Chunks along each axis.
+    pub(super) fn grid(&self) -> Vec<u64> {
+        let axes = self.shape.iter().zip(&self.chunk);
+        axes.map(|(length, chunk)| length.div_ceil(*chunk))
+            .collect()
+    }
+
+    /// Of a `zarr.json`, version 3.
+    pub(super) fn version_3(json: &Value) -> Result<Self, Refusal> {
+        if json["node_type"]
+            .as_str()
+            .is_some_and(|node| node != "array")
+        {
+            return Err(Refusal::wrong("a level is listed, but is no array"));
         }
-        Ok(Self {
+        let transformers = json["storage_transformers"].as_array();
+        if transformers.is_some_and(|list| !list.is_empty()) {
+            let reason = "it has storage transformers, which are not known";
+            return Err(Refusal::Unsupported(reason.to_owned()));
+        }
+        let grid = &json["chunk_grid"];
+        if grid["name"].as_str().is_some_and(|name| name != "regular") {
+            let name = &grid["name"];
+            return Err(Refusal::Unsupported(format!(
+                "its chunks are {name}, not regular"
+            )));
+        }
+        let (shape, stored) = shapes(&json["shape"], &grid["configuration"]["chunk_shape"])?;
+        let number = match json["data_type"].as_str() {
+            Some(name) => Number::named(name).ok_or_else(|| unknown_number(name))?,
+            None => return Err(unknown_number(&json["data_type"].to_string())),
+        };
+        let encoding = &json["chunk_key_encoding"];
+        let separator = &encoding["configuration"]["separator"];
+        let prefixed = encoding["name"].as_str() != Some("v2");
+        let keys = Keys {
+            prefixed,
+            separator: separator_of(separator, if prefixed { '/' } else { '.' })?,
+        };
+        let codecs = json["codecs"].as_array();
+        let codecs = codecs.ok_or_else(|| Refusal::wrong("it has no codecs"))?;
+        let rank = shape.len();
+        let (chunk, encoding, sharding) = match &codecs[..] {
+            [codec] if codec["name"] == "sharding_indexed" => {
+                let (chunk, encoding, sharding) =
+                    sharded(&codec["configuration"], &stored, number)?;
+                (chunk, encoding, Some(sharding))
+            }
+            codecs => (stored.clone(), encoding_of(codecs, rank, number)?, None),
+        };
+        let fill = fill_3(&json["fill_value"], number, encoding.big_endian)?;
+        Self {
             shape,
             chunk,
-            dtype,
-        })
-    }
-
-    fn stored(&self, folder: &Path) -> Result<Stored, ZarrError> {
-        Ok(match self.dtype.as_str() {
-            "uint8" | "|u1" | "<u1" | ">u1" => Stored::Uint8,
-            "int8" | "|i1" | "<i1" | ">i1" => Stored::Int8,
-            "uint16" | "<u2" | ">u2" => Stored::Uint16,
-            "int16" | "<i2" | ">i2" => Stored::Int16,
-            other => {
-                return Err(ZarrError::Unsupported {
-                    reason: format!(
-                        "its values are {other}; integers of 8 and 16 bit are shown, others would lose \
-                         what nobody could see: convert them"
-                    ),
-                    path: folder.to_owned(),
-                });
-            }
-        })
-    }
-}
-
-/// A level of an image.
-pub(super) struct LevelArray {
-    path: super::ArrayPath,
-    axes: Vec<Axis>,
-    extent: UVec3,
-    channels: u32,
-    stored: Stored,
-    cache: ChunkCacheDecodedLruSizeLimit,
-}
-
-impl std::fmt::Debug for LevelArray {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("LevelArray")
-            .field("path", &self.path)
-            .finish_non_exhaustive()
-    }
-}
-
-impl LevelArray {
-    /// Opens the array in a folder, whose axes are known. Keeps decoded chunks of up to `cache` bytes.
-    pub(super) fn open(folder: &Path, axes: &[Axis], cache: u64) -> Result<Self, ZarrError> {
-        let metadata = Metadata::read(folder)?;
-        let wrong = |reason: String| ZarrError::Metadata {
-            reason,
-            path: folder.to_owned(),
-        };
-        if metadata.shape.len() != axes.len() {
-            let (got, named) = (metadata.shape.len(), axes.len());
-            return Err(wrong(format!("it has {got} axes, and {named} have names")));
+            number,
+            encoding,
+            sharding,
+            keys,
+            fill,
         }
-        let stored = metadata.stored(folder)?;
-        let bytes = match stored {
-            Stored::Uint8 | Stored::Int8 => 1,
-            Stored::Uint16 | Stored::Int16 => 2,
+        .checked()
+    }
+
+    /// Of a `.zarray`, version 2.
+    pub(super) fn version_2(json: &Value) -> Result<Self, Refusal> {
+        let (shape, chunk) = shapes(&json["shape"], &json["chunks"])?;
+        let dtype = &json["dtype"];
+        let (number, big_endian) = dtype_2(dtype.as_str()).ok_or_else(|| match dtype.as_str() {
+            Some(name) => unknown_number(name),
+            None => unknown_number(&dtype.to_string()),
+        })?;
+        let mut codecs = Vec::new();
+        let filters = json["filters"].as_array().into_iter().flatten();
+        for codec in filters.chain(Some(&json["compressor"]).filter(|codec| !codec.is_null())) {
+            codecs.push(codec_named(codec["id"].as_str().unwrap_or_default())?);
+        }
+        let mut order: Vec<usize> = (0..shape.len()).collect();
+        match json["order"].as_str() {
+            Some("F") => order.reverse(),
+            Some("C") | None => {}
+            Some(other) => {
+                return Err(Refusal::Wrong(format!(
+                    "its order {other:?} is neither C nor F"
+                )));
+            }
+        }
+        let keys = Keys {
+            prefixed: false,
+            separator: separator_of(&json["dimension_separator"], '.')?,
         };
-        let mut decoded = metadata.chunk.iter();
-        let decoded = decoded.try_fold(bytes, |product: u64, n| product.checked_mul(*n));
+        let fill = fill_3(&json["fill_value"], number, big_endian)?;
+        Self {
+            shape,
+            chunk,
+            number,
+            encoding: Encoding {
+                order,
+                big_endian,
+                codecs,
+            },
+            sharding: None,
+            keys,
+            fill,
+        }
+        .checked()
+    }
+
+    /// Refuses what would take absurdly much memory.
+    fn checked(self) -> Result<Self, Refusal> {
+        let bytes = self.number.bytes() as u64;
+        let decoded = self
+            .chunk
+            .iter()
+            .try_fold(bytes, |product, n| product.checked_mul(*n));
         if decoded.is_none_or(|decoded| decoded > MOST_CHUNK) {
-            let chunk = &metadata.chunk;
-            return Err(wrong(format!(
+            let chunk = &self.chunk;
+            return Err(Refusal::Wrong(format!(
                 "its chunks of {chunk:?} values are too large to decode"
             )));
         }
-        let mut extent = UVec3::ONE;
-        let mut channels = 1;
-        for (axis, &length) in axes.iter().zip(&metadata.shape) {
-            let length = u32::try_from(length);
-            let length = length.map_err(|_| wrong("an axis is far too long".to_owned()))?;
-            match axis {
-                Axis::T => {}
-                Axis::C => channels = length,
-                Axis::Space(axis) => extent[*axis] = length,
+        let grid = self.grid();
+        if grid
+            .iter()
+            .try_fold(1_u64, |product, n| product.checked_mul(*n))
+            .is_none()
+        {
+            return Err(Refusal::wrong("it has more chunks than can be counted"));
+        }
+        if let Some(sharding) = &self.sharding {
+            let count = sharding
+                .chunks
+                .iter()
+                .try_fold(1_u64, |product, n| product.checked_mul(*n));
+            if count.is_none_or(|count| count > MOST_IN_SHARD) {
+                return Err(Refusal::Wrong(format!(
+                    "its shards hold more than {MOST_IN_SHARD} chunks each"
+                )));
             }
         }
-        let failed = |source: Box<dyn std::error::Error + Send + Sync>| ZarrError::Array {
-            source,
-            path: folder.to_owned(),
-        };
-        let store = FilesystemStore::new(folder).map_err(|e| failed(e.into()))?;
-        let store: Arc<dyn ReadableStorageTraits> = Arc::new(store);
-        let array = Array::open(store, "/").map_err(|e| failed(e.into()))?;
-        Ok(Self {
-            path: folder.to_owned(),
-            axes: axes.to_vec(),
-            extent,
-            channels,
-            stored,
-            cache: ChunkCacheDecodedLruSizeLimit::new(Arc::new(array), cache),
-        })
-    }
-
-    pub(super) fn path(&self) -> &PathBuf {
-        &self.path
-    }
-
-    /// Size \[voxels\].
-    pub(super) fn extent(&self) -> UVec3 {
-        self.extent
-    }
-
-    pub(super) fn channels(&self) -> u32 {
-        self.channels
-    }
-
-    /// Type of the voxels that [`Self::read`] gives.
-    pub(super) fn dtype(&self) -> Dtype {
-        match self.stored {
-            Stored::Uint8 | Stored::Int8 => Dtype::Uint8,
-            Stored::Uint16 | Stored::Int16 => Dtype::Uint16,
-        }
-    }
-
-    /// A chunk of `size`, x fastest, little-endian, with the voxels of `inside` and 0 beyond.
-    pub(super) fn read(
-        &self,
-        channel: u32,
-        inside: VoxelBox,
-        size: UVec3,
-    ) -> Result<Vec<u8>, ZarrError> {
-        let range = |from: u32, to: u32| u64::from(from)..u64::from(to);
-        let subset = self.axes.iter().map(|axis| match axis {
-            Axis::T => 0..1,
-            Axis::C => range(channel, channel + 1),
-            Axis::Space(axis) => range(inside.min[*axis], inside.max[*axis]),
-        });
-        let subset: Vec<Range<u64>> = subset.collect();
-        let options = CodecOptions::default();
-        let subset = &subset[..];
-        macro_rules! values {
-            ($type:ty) => {
-                self.cache
-                    .retrieve_array_subset::<Vec<$type>>(&subset, &options)
-            };
-        }
-        let bytes = match self.stored {
-            Stored::Uint8 => values!(u8),
-            Stored::Int8 => values!(i8).map(|values| {
-                let up = values.into_iter().map(|value| value.cast_unsigned() ^ 0x80);
-                up.collect()
-            }),
-            Stored::Uint16 => values!(u16).map(|values| to_bytes(&values)),
-            Stored::Int16 => values!(i16).map(|values| {
-                let up = values
-                    .into_iter()
-                    .map(|value| value.cast_unsigned() ^ 0x8000);
-                to_bytes(&up.collect::<Vec<u16>>())
-            }),
-        };
-        let bytes = bytes.map_err(|error| ZarrError::Array {
-            source: error.into(),
-            path: self.path.clone(),
-        })?;
-        Ok(self.arranged(&bytes, inside, size))
-    }
-
-    /// Voxels of a box in the order of the array's axes, as a chunk in the order of ours.
-    fn arranged(&self, values: &[u8], inside: VoxelBox, size: UVec3) -> Vec<u8> {
-        let width = self.dtype().bytes();
-        let (mut chunk, chunk_width, chunk_height) = padded(size, inside, width);
-        // Values between neighbours along x, y, z.
-        let mut strides = [0; 3];
-        let mut stride = 1;
-        for axis in self.axes.iter().rev() {
-            if let Axis::Space(axis) = axis {
-                strides[*axis] = stride;
-                stride *= inside.size()[*axis] as usize;
-            }
-        }
-        let [nx, ny, nz] = inside.size().to_array().map(|n| n as usize);
-        for z in 0..nz {
-            for y in 0..ny {
-                let from = z * strides[2] + y * strides[1];
-                let to = (z * chunk_height + y) * chunk_width * width;
-                let row = &mut chunk[to..][..nx * width];
-                if strides[0] == 1 {
-                    row.copy_from_slice(&values[from * width..][..nx * width]);
-                } else {
-                    for (x, voxel) in row.chunks_exact_mut(width).enumerate() {
-                        voxel.copy_from_slice(&values[(from + x * strides[0]) * width..][..width]);
-                    }
-                }
-            }
-        }
-        chunk
+        Ok(self)
     }
 }
 
-fn to_bytes(values: &[u16]) -> Vec<u8> {
-    values
-        .iter()
-        .flat_map(|value| value.to_le_bytes())
-        .collect()
+fn shapes(shape: &Value, chunk: &Value) -> Result<(Vec<u64>, Vec<u64>), Refusal> {
+    let shape = numbers(shape).ok_or_else(|| Refusal::wrong("it has no shape"))?;
+    let chunk = numbers(chunk).ok_or_else(|| Refusal::wrong("it has no chunk shape"))?;
+    if shape.len() != chunk.len() || shape.contains(&0) || chunk.contains(&0) {
+        return Err(Refusal::wrong(
+            "its shape and that of its chunks do not fit",
+        ));
+    }
+    Ok((shape, chunk))
+}
+
+fn unknown_number(name: &str) -> Refusal {
+    Refusal::Unsupported(format!(
+        "its values are {name}; whole numbers of 8 to 64 bit and floating-point ones of 32 and 64 bit \
+         are shown: convert them"
+    ))
+}
+
+fn separator_of(value: &Value, default: char) -> Result<char, Refusal> {
+    match value.as_str() {
+        None if value.is_null() => Ok(default),
+        Some("/") => Ok('/'),
+        Some(".") => Ok('.'),
+        _ => Err(Refusal::Wrong(format!("its keys are separated by {value}"))),
+    }
+}
+
+/// A shard's chunks, their encoding, and where they are.
+fn sharded(
+    configuration: &Value,
+    shard: &[u64],
+    number: Number,
+) -> Result<(Vec<u64>, Encoding, Sharding), Refusal> {
+    let wrong = |reason: &str| Refusal::wrong(reason);
+    let chunk = numbers(&configuration["chunk_shape"]);
+    let chunk = chunk.ok_or_else(|| wrong("its shards' chunks have no shape"))?;
+    let fits = chunk.len() == shard.len() && { shard.iter().zip(&chunk) }
+        .all(|(shard, chunk)| *chunk > 0 && shard % chunk == 0);
+    if !fits {
+        return Err(wrong("its shards cannot be cut into its chunks"));
+    }
+    let codecs = configuration["codecs"].as_array();
+    let codecs = codecs.ok_or_else(|| wrong("its shards' chunks have no codecs"))?;
+    let encoding = encoding_of(codecs, shard.len(), number)?;
+    let index = configuration["index_codecs"].as_array();
+    let index = index.ok_or_else(|| wrong("its shards' indices have no codecs"))?;
+    let index = encoding_of(index, shard.len() + 1, Number::U64)?;
+    let checked = match &index.codecs[..] {
+        [] => false,
+        [Codec::Crc32c] => true,
+        _ => {
+            let reason = "its shards' indices are compressed, so that nobody knows their length";
+            return Err(Refusal::Unsupported(reason.to_owned()));
+        }
+    };
+    if !index.order.is_sorted() {
+        return Err(Refusal::Unsupported(
+            "its shards' indices are transposed".to_owned(),
+        ));
+    }
+    let index_at_start = match configuration["index_location"].as_str() {
+        Some("start") => true,
+        Some("end") | None => false,
+        Some(other) => {
+            return Err(Refusal::Wrong(format!(
+                "its shards' indices are at the {other:?}"
+            )));
+        }
+    };
+    let sharding = Sharding {
+        chunks: shard
+            .iter()
+            .zip(&chunk)
+            .map(|(shard, chunk)| shard / chunk)
+            .collect(),
+        index_at_start,
+        index_big_endian: index.big_endian,
+        index_checked: checked,
+    };
+    Ok((chunk, encoding, sharding))
+}
+
+/// `transpose`s, `bytes`, and codecs of bytes.
+fn encoding_of(codecs: &[Value], rank: usize, number: Number) -> Result<Encoding, Refusal> {
+    let mut encoding = Encoding {
+        order: (0..rank).collect(),
+        big_endian: false,
+        codecs: Vec::new(),
+    };
+    let mut as_bytes = false;
+    for codec in codecs {
+        // Some write a plain name where nothing is configured.
+        let name = codec["name"]
+            .as_str()
+            .or(codec.as_str())
+            .unwrap_or_default();
+        let configuration = &codec["configuration"];
+        match (name, as_bytes) {
+            ("transpose", false) => {
+                let order = numbers(&configuration["order"]).unwrap_or_default();
+                let mut seen = vec![false; rank];
+                for axis in &order {
+                    if let Some(seen) = usize::try_from(*axis)
+                        .ok()
+                        .and_then(|axis| seen.get_mut(axis))
+                    {
+                        *seen = true;
+                    }
+                }
+                if order.len() != rank || seen.contains(&false) {
+                    return Err(Refusal::wrong("its transposition is no order of its axes"));
+                }
+                let axis = |axis: &u64| usize::try_from(*axis).map(|axis| encoding.order[axis]);
+                let order: Result<Vec<usize>, _> = order.iter().map(axis).collect();
+                encoding.order = order.map_err(Refusal::wrong)?;
+            }
+            ("bytes", false) => {
+                as_bytes = true;
+                encoding.big_endian = match configuration["endian"].as_str() {
+                    Some("little") => false,
+                    Some("big") => true,
+                    None if number.bytes() == 1 => false,
+                    _ => {
+                        return Err(Refusal::wrong(
+                            "it does not say the order of its bytes (endian)",
+                        ));
+                    }
+                };
+            }
+            (name, true) => encoding.codecs.push(codec_named(name)?),
+            (name, false) => return Err(unknown_codec(name)),
+        }
+    }
+    if as_bytes {
+        Ok(encoding)
+    } else {
+        Err(Refusal::wrong("its codecs do not make bytes"))
+    }
+}
+
+fn codec_named(name: &str) -> Result<Codec, Refusal> {
+    Ok(match name {
+        "gzip" => Codec::Gzip,
+        "zlib" | "numcodecs.zlib" => Codec::Zlib,
+        "zstd" | "numcodecs.zstd" => Codec::Zstd,
+        "blosc" | "numcodecs.blosc" => Codec::Blosc,
+        "lz4" | "numcodecs.lz4" => Codec::Lz4,
+        "crc32c" => Codec::Crc32c,
+        _ => return Err(unknown_codec(name)),
+    })
+}
+
+fn unknown_codec(name: &str) -> Refusal {
+    Refusal::Unsupported(format!(
+        "it is encoded by {name:?}; blosc, zstd, gzip, zlib, lz4 and crc32c are known, and shards whose chunks are"
+    ))
+}
+
+/// Version 2's names: `<u2`.
+fn dtype_2(name: Option<&str>) -> Option<(Number, bool)> {
+    let name = name?;
+    let (order, kind) = name.split_at_checked(1)?;
+    let number = match kind {
+        "u1" => Number::U8,
+        "i1" => Number::I8,
+        "u2" => Number::U16,
+        "i2" => Number::I16,
+        "u4" => Number::U32,
+        "i4" => Number::I32,
+        "u8" => Number::U64,
+        "i8" => Number::I64,
+        "f4" => Number::F32,
+        "f8" => Number::F64,
+        _ => return None,
+    };
+    match order {
+        "<" => Some((number, false)),
+        ">" => Some((number, true)),
+        "|" if number.bytes() == 1 => Some((number, false)),
+        _ => None,
+    }
+}
+
+/// The number of what is not stored, as it would be; 0 where nothing is said.
+fn fill_3(value: &Value, number: Number, big_endian: bool) -> Result<Vec<u8>, Refusal> {
+    let unknown = || Refusal::Wrong(format!("its fill value {value} is no {number}"));
+    let float = match value.as_str() {
+        Some("NaN") => Some(f64::NAN),
+        Some("Infinity") => Some(f64::INFINITY),
+        Some("-Infinity") => Some(f64::NEG_INFINITY),
+        Some(_) => return Err(unknown()),
+        None => value.as_f64(),
+    };
+    let float = float
+        .or_else(|| value.is_null().then_some(0.0))
+        .ok_or_else(unknown)?;
+    // Version 2 writers say 0.0 for whole numbers as well.
+    let whole = value
+        .as_i64()
+        .map(i128::from)
+        .or_else(|| value.as_u64().map(i128::from));
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "only whole numbers within 2^63, which are kept"
+    )]
+    let whole = whole
+        .or_else(|| (float.fract() == 0.0 && float.abs() < 9e18).then(|| i128::from(float as i64)));
+    let whole = || whole.ok_or_else(unknown);
+    macro_rules! stored {
+        ($type:ty) => {
+            <$type>::try_from(whole()?)
+                .map_err(|_| unknown())?
+                .to_le_bytes()
+                .to_vec()
+        };
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "to the type's precision")]
+    let mut bytes = match number {
+        Number::U8 => stored!(u8),
+        Number::I8 => stored!(i8),
+        Number::U16 => stored!(u16),
+        Number::I16 => stored!(i16),
+        Number::U32 => stored!(u32),
+        Number::I32 => stored!(i32),
+        Number::U64 => stored!(u64),
+        Number::I64 => stored!(i64),
+        Number::F32 => (float as f32).to_le_bytes().to_vec(),
+        Number::F64 => float.to_le_bytes().to_vec(),
+    };
+    if big_endian {
+        bytes.reverse();
+    }
+    Ok(bytes)
 }

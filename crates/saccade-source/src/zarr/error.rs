@@ -1,60 +1,73 @@
-use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-/// Why an OME-Zarr image cannot be shown, or a part of it not read.
-#[derive(Debug, thiserror::Error)]
+use crate::objects::ObjectError;
+use crate::stored::PieceError;
+
+/// Why an OME-Zarr image cannot be opened.
+#[derive(Clone, Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ZarrError {
-    /// A file cannot be read.
-    #[error("cannot read {}", path.display())]
+    /// Metadata cannot be read.
+    #[error("the metadata cannot be read")]
     Read {
-        /// What the system says.
-        source: std::io::Error,
-        /// The file.
-        path: PathBuf,
+        /// What went wrong.
+        source: Arc<ObjectError>,
+    },
+    /// There is no image.
+    #[error("there is neither zarr.json nor .zattrs, so it is no OME-Zarr image: {location}")]
+    NoImage {
+        /// Folder or address.
+        location: String,
     },
     /// Metadata that are no JSON, or say what cannot be.
-    #[error("the metadata make no sense: {reason}: {}", path.display())]
+    #[error("the metadata make no sense: {reason}: {location}")]
     Metadata {
         /// What is wrong.
         reason: String,
-        /// The file or folder.
-        path: PathBuf,
+        /// File, folder or address.
+        location: String,
     },
     /// An image that is of another kind.
-    #[error("this cannot be shown: {reason}: {}", path.display())]
+    #[error("this cannot be shown: {reason}: {location}")]
     Unsupported {
         /// What is not supported, and what would be.
         reason: String,
-        /// The folder.
-        path: PathBuf,
+        /// Folder or address.
+        location: String,
     },
-    /// An array cannot be opened, or a part of it not be decoded.
-    #[error("the array is damaged or of an unknown kind: {}", path.display())]
-    Array {
-        /// What the decoder says.
-        source: Box<dyn std::error::Error + Send + Sync>,
-        /// The array's folder.
-        path: PathBuf,
+    /// The voxels by which to choose how wide values are shown cannot be read.
+    #[error("its values cannot be looked at, which is needed to show them in 16 bit")]
+    Sample {
+        /// What went wrong.
+        source: PieceError,
     },
 }
 
-impl ZarrError {
-    /// Whether the same may succeed later.
-    pub(super) fn is_transient(&self) -> bool {
-        match self {
-            Self::Read { source, .. } => !matches!(
-                source.kind(),
-                std::io::ErrorKind::NotFound | std::io::ErrorKind::PermissionDenied
-            ),
-            Self::Metadata { .. } | Self::Unsupported { .. } | Self::Array { .. } => false,
-        }
+impl From<ObjectError> for ZarrError {
+    fn from(source: ObjectError) -> Self {
+        let source = Arc::new(source);
+        Self::Read { source }
+    }
+}
+
+/// What is wrong with metadata, before it is known where they are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum Refusal {
+    /// They say what cannot be.
+    Wrong(String),
+    /// They say what is not supported.
+    Unsupported(String),
+}
+
+impl Refusal {
+    pub(crate) fn wrong(reason: impl ToString) -> Self {
+        Self::Wrong(reason.to_string())
     }
 
-    /// The task that worked on it ended before it was done.
-    pub(super) fn interrupted(path: &Path, error: &tokio::task::JoinError) -> Self {
-        Self::Array {
-            source: error.to_string().into(),
-            path: path.to_owned(),
+    pub(crate) fn at(self, location: String) -> ZarrError {
+        match self {
+            Self::Wrong(reason) => ZarrError::Metadata { reason, location },
+            Self::Unsupported(reason) => ZarrError::Unsupported { reason, location },
         }
     }
 }

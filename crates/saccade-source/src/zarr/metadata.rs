@@ -1,14 +1,9 @@
 //! What the metadata of a group say of its image.
 
-use std::path::{Component, Path};
-
 use glam::DVec3;
 use serde_json::Value;
 
-use super::ZarrError;
-
-/// Metadata files larger than this are not read \[bytes\].
-const MOST_METADATA: u64 = 16 << 20;
+use super::error::Refusal;
 
 /// What an axis of an array is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,157 +23,168 @@ pub(super) struct Image {
     pub(super) axes: Vec<Axis>,
     /// Voxel size of the finest level \[nm\].
     pub(super) voxel_nm: DVec3,
-    /// Levels, finest first.
-    pub(super) datasets: Vec<Dataset>,
-    /// Names of channels, as far as they have any.
-    pub(super) channels: Vec<String>,
+    /// Whether the metadata say so.
+    pub(super) has_size: bool,
+    /// Finest voxels per voxel, by level, where transformations tell.
+    pub(super) downsampling: Vec<Option<DVec3>>,
+    /// Channels, as far as anything is said of them.
+    pub(super) channels: Vec<Channel>,
+    /// Whether its values name things.
+    pub(super) is_labels: bool,
 }
 
-/// A level.
-#[derive(Debug)]
-pub(super) struct Dataset {
-    /// Folder of its array, below the image's.
-    pub(super) path: String,
-    /// Finest voxels per voxel, if transformations tell.
-    pub(super) downsampling: Option<DVec3>,
+/// What is said of a channel.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Channel {
+    /// Empty for none.
+    pub(super) label: String,
+    /// Red, green, blue.
+    pub(super) color: Option<[u8; 3]>,
+    /// Values at the two ends of its colours, as stored.
+    pub(super) window: Option<[f64; 2]>,
+    /// The values that there can be.
+    pub(super) whole: Option<[f64; 2]>,
+    /// Whether it is shown at first.
+    pub(super) active: bool,
 }
 
-/// JSON of a file; `None` if there is no such file.
-pub(super) fn json(path: &Path) -> Result<Option<Value>, ZarrError> {
-    let failed = |source| ZarrError::Read {
-        source,
-        path: path.to_owned(),
-    };
-    let size = match std::fs::metadata(path) {
-        Ok(metadata) => metadata.len(),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(error) => return Err(failed(error)),
-    };
-    let wrong = |reason: String| ZarrError::Metadata {
-        reason,
-        path: path.to_owned(),
-    };
-    if size > MOST_METADATA {
-        return Err(wrong(format!("{size} bytes are no metadata")));
+/// The part of a group's attributes that says what the image is, whatever its version.
+pub(super) fn ome(attributes: &Value) -> &Value {
+    // Version 0.5 has a name space of its own.
+    let ome = &attributes["ome"];
+    if ome.is_object() { ome } else { attributes }
+}
+
+/// Paths of an image's levels, finest first.
+pub(super) fn paths(ome: &Value) -> Result<Vec<String>, Refusal> {
+    let refused = |reason: &str| Refusal::Unsupported(reason.to_owned());
+    if ome["plate"].is_object() {
+        let wells = ome["plate"]["wells"].as_array().into_iter().flatten();
+        let wells = wells.filter_map(|well| well["path"].as_str()).take(3);
+        let wells: Vec<String> = wells.map(|well| format!("PLATE/{well}/0")).collect();
+        let such = match &*wells {
+            [] => "PLATE/A/1/0".to_owned(),
+            wells => wells.join(" or "),
+        };
+        return Err(refused(&format!(
+            "it is a plate of many images; name one of them, as in {such}"
+        )));
     }
-    let text = std::fs::read(path).map_err(failed)?;
-    let value = serde_json::from_slice(&text).map_err(|error| wrong(error.to_string()))?;
-    Ok(Some(value))
-}
-
-/// The attributes of a group, whatever its version.
-fn attributes(folder: &Path) -> Result<Value, ZarrError> {
-    if let Some(group) = json(&folder.join("zarr.json"))? {
-        let attributes = &group["attributes"];
-        // Version 0.5 has a name space of its own.
-        let ome = &attributes["ome"];
-        return Ok(if ome.is_object() {
-            ome.clone()
-        } else {
-            attributes.clone()
-        });
+    if ome["well"].is_object() {
+        return Err(refused(
+            "it is a well of several images; name one of them, as in WELL/0",
+        ));
     }
-    let attributes = json(&folder.join(".zattrs"))?;
-    attributes.ok_or_else(|| ZarrError::Unsupported {
-        reason: "there is neither zarr.json nor .zattrs, so it is no OME-Zarr image".to_owned(),
-        path: folder.to_owned(),
-    })
+    if !ome["bioformats2raw.layout"].is_null() && ome["multiscales"].is_null() {
+        return Err(refused(
+            "it is a collection of images; name one of them, as in COLLECTION/0",
+        ));
+    }
+    if let Some(labels) = ome["labels"].as_array()
+        && ome["multiscales"].is_null()
+    {
+        let names: Vec<&str> = labels.iter().filter_map(Value::as_str).take(5).collect();
+        let names = names.join(", ");
+        return Err(refused(&format!(
+            "it is a list of label images; name one of them, as in LABELS/NAME: {names}"
+        )));
+    }
+    let multiscale = &ome["multiscales"][0];
+    if !multiscale.is_object() {
+        return Err(refused(
+            "it has no multiscales, so it is no OME-Zarr image; name the image in it",
+        ));
+    }
+    let datasets = multiscale["datasets"].as_array();
+    let datasets = datasets.filter(|list| !list.is_empty());
+    let datasets = datasets.ok_or_else(|| Refusal::wrong("it lists no levels (datasets)"))?;
+    let path = |dataset: &Value| {
+        let path = dataset["path"].as_str();
+        let path = path.ok_or_else(|| Refusal::wrong("a level (dataset) has no path"))?;
+        let parts = path.split('/').filter(|part| !matches!(*part, "" | "."));
+        let inside = parts
+            .clone()
+            .all(|part| part != ".." && !part.contains(['\\', '\0']));
+        if path.starts_with('/') || !inside {
+            let outside = format!("the level {path:?} lies outside of the image");
+            return Err(Refusal::Wrong(outside));
+        }
+        Ok(parts.collect::<Vec<_>>().join("/"))
+    };
+    datasets.iter().map(path).collect()
 }
 
 impl Image {
-    /// Reads the metadata of the image in a folder.
-    pub(super) fn read(folder: &Path) -> Result<Self, ZarrError> {
-        let attributes = attributes(folder)?;
-        let refused = |reason: &str| ZarrError::Unsupported {
-            reason: reason.to_owned(),
-            path: folder.to_owned(),
-        };
-        let wrong = |reason: &str| ZarrError::Metadata {
-            reason: reason.to_owned(),
-            path: folder.to_owned(),
-        };
-        if attributes["plate"].is_object() {
-            return Err(refused(
-                "it is a plate of many images; name one of them, as in PLATE/A/1/0",
-            ));
-        }
-        if attributes["well"].is_object() {
-            return Err(refused(
-                "it is a well of several images; name one of them, as in WELL/0",
-            ));
-        }
-        if !attributes["bioformats2raw.layout"].is_null() && attributes["multiscales"].is_null() {
-            return Err(refused(
-                "it is a collection of images; name one of them, as in COLLECTION/0",
-            ));
-        }
-        let multiscale = &attributes["multiscales"][0];
-        if !multiscale.is_object() {
-            return Err(refused(
-                "it has no multiscales, so it is no OME-Zarr image; name the image in it",
-            ));
-        }
+    /// Of attributes, and of the number of axes that its arrays have.
+    pub(super) fn parse(ome: &Value, rank: usize) -> Result<Self, Refusal> {
+        let multiscale = &ome["multiscales"][0];
+        let named = named_axes(multiscale);
+        let axes = axes(named, rank)?;
         let datasets = multiscale["datasets"].as_array();
-        let datasets = datasets.filter(|list| !list.is_empty());
-        let datasets = datasets.ok_or_else(|| wrong("it lists no levels (datasets)"))?;
-        let paths = datasets.iter().map(|dataset| dataset["path"].as_str());
-        let paths: Option<Vec<&str>> = paths.collect();
-        let paths = paths.ok_or_else(|| wrong("a level (dataset) has no path"))?;
-        if let Some(outside) = paths.iter().find(|path| !is_inside(path)) {
-            return Err(wrong(&format!(
-                "the level {outside:?} lies outside of the image"
-            )));
-        }
-        let axes = axes(folder, multiscale, paths[0])?;
-        let scales = datasets
-            .iter()
-            .map(|dataset| scale(&axes, &dataset["coordinateTransformations"]));
+        let scales = datasets.into_iter().flatten();
+        let scales = scales.map(|dataset| scale(&axes, &dataset["coordinateTransformations"]));
         let scales: Vec<Option<DVec3>> = scales.collect();
         let of_all = scale(&axes, &multiscale["coordinateTransformations"]).unwrap_or(DVec3::ONE);
-        let finest = scales[0].unwrap_or(DVec3::ONE);
-        let units = units(multiscale, &axes);
-        if scales[0].is_none() || units.is_none() {
-            let path = folder.display();
-            log::warn!(
-                "the image does not say how large its voxels are; taken for 1 micrometer where it does not: {path}"
-            );
-        }
+        let finest = scales.first().copied().flatten();
+        let units = named.and_then(|named| units(named, &axes));
+        let has_size = finest.is_some() && units.is_some();
+        let finest = finest.unwrap_or(DVec3::ONE);
         let mut voxel_nm = finest * of_all * units.unwrap_or(DVec3::splat(1e3));
         if !axes.contains(&Axis::Space(2)) {
             voxel_nm.z = voxel_nm.x;
         }
         if !(voxel_nm.is_finite() && voxel_nm.min_element() > 0.0) {
-            return Err(wrong("its voxels have no size (coordinateTransformations)"));
+            let reason = "its voxels have no size (coordinateTransformations)";
+            return Err(Refusal::wrong(reason));
         }
-        let datasets = paths.iter().zip(scales).map(|(path, scale)| Dataset {
-            path: (*path).to_owned(),
-            downsampling: scale.map(|scale| scale / finest).filter(|d| d.is_finite()),
-        });
-        let channels = attributes["omero"]["channels"].as_array();
-        let channels = channels.into_iter().flatten();
-        let label = |channel: &Value| channel["label"].as_str().unwrap_or_default().to_owned();
+        let downsampling = scales.into_iter();
+        let downsampling =
+            downsampling.map(|scale| Some(scale? / finest).filter(|d| d.is_finite()));
+        let channels = ome["omero"]["channels"].as_array().into_iter().flatten();
         Ok(Self {
             voxel_nm,
-            datasets: datasets.collect(),
-            channels: channels.map(label).collect(),
+            has_size,
+            downsampling: downsampling.collect(),
+            channels: channels.map(channel).collect(),
+            is_labels: ome["image-label"].is_object(),
             axes,
         })
     }
 }
 
-/// Whether a level's path stays below its image's folder.
-fn is_inside(path: &str) -> bool {
-    let mut parts = Path::new(path).components();
-    parts.all(|part| matches!(part, Component::Normal(_) | Component::CurDir))
+fn channel(channel: &Value) -> Channel {
+    let window = &channel["window"];
+    let pair = |low: &str, high: &str| {
+        let pair = [window[low].as_f64()?, window[high].as_f64()?];
+        (pair[0] < pair[1]).then_some(pair)
+    };
+    Channel {
+        label: channel["label"].as_str().unwrap_or_default().to_owned(),
+        color: channel["color"].as_str().and_then(color),
+        window: pair("start", "end"),
+        whole: pair("min", "max"),
+        active: channel["active"].as_bool().unwrap_or(true),
+    }
+}
+
+/// Six hexadecimal digits, with or without a hash in front; eight if there is opacity behind.
+fn color(text: &str) -> Option<[u8; 3]> {
+    let text = text.strip_prefix('#').unwrap_or(text);
+    let digits = matches!(text.len(), 6 | 8) && text.bytes().all(|b| b.is_ascii_hexdigit());
+    let number = digits.then(|| u32::from_str_radix(&text[..6], 16).ok())??;
+    let [_, red, green, blue] = number.to_be_bytes();
+    Some([red, green, blue])
+}
+
+/// Before version 0.6 axes are listed; there, they are those of the first coordinate system.
+fn named_axes(multiscale: &Value) -> Option<&Vec<Value>> {
+    let listed = multiscale["axes"].as_array();
+    listed.or_else(|| multiscale["coordinateSystems"][0]["axes"].as_array())
 }
 
 /// Axes by name; before version 0.3 they had none, and were t, c, z, y, x.
-fn axes(folder: &Path, multiscale: &Value, first: &str) -> Result<Vec<Axis>, ZarrError> {
-    let wrong = |reason: String| ZarrError::Metadata {
-        reason,
-        path: folder.to_owned(),
-    };
-    let named = multiscale["axes"].as_array();
+fn axes(named: Option<&Vec<Value>>, rank: usize) -> Result<Vec<Axis>, Refusal> {
+    let wrong = |reason: String| Refusal::Wrong(reason);
     let names: Vec<String> = match named {
         Some(axes) => {
             // Version 0.3 had plain names.
@@ -191,8 +197,7 @@ fn axes(folder: &Path, multiscale: &Value, first: &str) -> Result<Vec<Axis>, Zar
             names.ok_or_else(|| wrong("an axis has no name".to_owned()))?
         }
         None => {
-            let array = super::array::Metadata::read(&folder.join(first))?;
-            let skip = 5_usize.checked_sub(array.shape.len());
+            let skip = 5_usize.checked_sub(rank);
             let skip = skip.ok_or_else(|| wrong("more than five axes have no names".to_owned()))?;
             ["t", "c", "z", "y", "x"][skip..]
                 .iter()
@@ -200,6 +205,10 @@ fn axes(folder: &Path, multiscale: &Value, first: &str) -> Result<Vec<Axis>, Zar
                 .collect()
         }
     };
+    if names.len() != rank {
+        let named = names.len();
+        return Err(wrong(format!("it has {rank} axes, and {named} have names")));
+    }
     let mut axes = Vec::new();
     for name in &names {
         let axis = match name.as_str() {
@@ -209,10 +218,9 @@ fn axes(folder: &Path, multiscale: &Value, first: &str) -> Result<Vec<Axis>, Zar
             "y" => Axis::Space(1),
             "z" => Axis::Space(2),
             _ => {
-                return Err(ZarrError::Unsupported {
-                    reason: format!("it has an axis {name:?}; t, c, z, y and x are known"),
-                    path: folder.to_owned(),
-                });
+                return Err(Refusal::Unsupported(format!(
+                    "it has an axis {name:?}; t, c, z, y and x are known"
+                )));
             }
         };
         if axes.contains(&axis) {
@@ -228,7 +236,13 @@ fn axes(folder: &Path, multiscale: &Value, first: &str) -> Result<Vec<Axis>, Zar
 
 /// The scale of a list of transformations, x, y, z; 1 for an axis that there is not.
 fn scale(axes: &[Axis], transformations: &Value) -> Option<DVec3> {
-    let scale = { transformations.as_array()?.iter() }.find_map(|t| t["scale"].as_array())?;
+    let list = transformations.as_array()?.iter();
+    // Version 0.6 has sequences of them.
+    let list = list.flat_map(|t| match t["transformations"].as_array() {
+        Some(sequence) => sequence.iter().collect(),
+        None => vec![t],
+    });
+    let scale = { list }.find_map(|t| t["scale"].as_array())?;
     let mut result = DVec3::ONE;
     for (axis, value) in axes.iter().zip(scale) {
         if let Axis::Space(axis) = axis {
@@ -239,8 +253,7 @@ fn scale(axes: &[Axis], transformations: &Value) -> Option<DVec3> {
 }
 
 /// Nanometres in the units of x, y, z; `None` where one has none.
-fn units(multiscale: &Value, axes: &[Axis]) -> Option<DVec3> {
-    let named = multiscale["axes"].as_array()?;
+fn units(named: &[Value], axes: &[Axis]) -> Option<DVec3> {
     let mut units: [Option<f64>; 3] = [None; 3];
     for (axis, value) in axes.iter().zip(named) {
         if let Axis::Space(axis) = axis {

@@ -1,0 +1,94 @@
+use std::ops::Range;
+use std::time::Duration;
+
+/// Why an object could not be read. That there is none is no error.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ObjectError {
+    /// A key that leads out of its store: the caller's mistake, or a trick in foreign metadata.
+    #[error("{key:?} names nothing below {location}")]
+    Key {
+        /// As asked for.
+        key: String,
+        /// Folder or address.
+        location: String,
+    },
+    /// The store forbids it.
+    #[error("access is denied; {advice}: {location}")]
+    Denied {
+        /// How to mend it.
+        advice: &'static str,
+        /// File or address.
+        location: String,
+    },
+    /// The store answers with something else than the object.
+    #[error("the answer is {answer}, not the object: {location}")]
+    Answer {
+        /// What came.
+        answer: String,
+        /// Address.
+        location: String,
+    },
+    /// The store does not answer, or not wholly, however often it is asked.
+    #[error("not read in {attempts} attempts: {reason}: {location}")]
+    Unavailable {
+        /// Times it was asked.
+        attempts: u32,
+        /// What went wrong the last time.
+        reason: String,
+        /// File or address.
+        location: String,
+    },
+    /// The object is longer than it may be.
+    #[error("it has more than {most} bytes, which is more than it can need: {location}")]
+    TooLong {
+        /// Bytes it may have.
+        most: u64,
+        /// File or address.
+        location: String,
+    },
+    /// The object ends before a range that something else says is there.
+    #[error("it ends before byte {}: {location}", wanted.end)]
+    TooShort {
+        /// What was asked for \[bytes\].
+        wanted: Range<u64>,
+        /// File or address.
+        location: String,
+    },
+    /// The system cannot read a file.
+    #[error("cannot read {location}")]
+    Io {
+        /// What it says.
+        source: std::io::Error,
+        /// File.
+        location: String,
+    },
+}
+
+impl ObjectError {
+    /// Whether the same may succeed later.
+    pub fn is_transient(&self) -> bool {
+        matches!(self, Self::Unavailable { .. } | Self::Io { .. })
+    }
+}
+
+/// Why one attempt failed, and whether another makes sense.
+#[derive(Debug)]
+pub(super) enum Failure {
+    /// Another attempt may succeed, after a wait if the store says so.
+    Again {
+        reason: String,
+        wait: Option<Duration>,
+    },
+    /// No attempt will.
+    Final(ObjectError),
+}
+
+impl Failure {
+    pub(super) fn again(reason: impl ToString) -> Self {
+        Self::Again {
+            reason: reason.to_string(),
+            wait: None,
+        }
+    }
+}

@@ -1,0 +1,237 @@
+//! Objects below an address, by HTTP: the same code natively and in browsers.
+
+mod answer;
+#[cfg(not(target_family = "wasm"))]
+#[path = "http/native.rs"]
+mod platform;
+#[cfg(target_family = "wasm")]
+#[path = "http/wasm.rs"]
+mod platform;
+#[cfg(all(test, not(target_family = "wasm")))]
+mod tests;
+
+use bytes::Bytes;
+use reqwest::{Client, StatusCode, Url, header};
+use tokio::sync::{OnceCell, Semaphore};
+
+use super::error::Failure;
+use super::{LocationError, ObjectError, Objects, Part, Patience, is_key};
+use crate::maybe_send::BoxFuture;
+
+/// Requests under way at once; more wait here, first come, first served.
+const REQUESTS: usize = 24;
+/// Names an object that nobody has: see [`HttpObjects`].
+const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
+
+/// Objects below an address.
+///
+/// # Answers
+///
+/// 404 and 410 mean that there is no such object. 403 does as well where the store answers so for
+/// whatever it does not have, as S3 does to those who may not list: with the first 403 it is asked for an
+/// object that nobody can have. 429, 5xx, broken connections, cut and stalled answers are asked for
+/// again, see [`Patience`]. A server that ignores ranges is put up with, and told of.
+///
+/// Natively, redirections to other hosts are not followed: whoever runs a store cannot make this computer ask others.
+#[derive(Debug)]
+pub struct HttpObjects {
+    client: Client,
+    base: Url,
+    patience: Patience,
+    requests: Semaphore,
+    /// Whether missing objects are forbidden here, once it was asked.
+    forbids_missing: OnceCell<bool>,
+}
+
+impl HttpObjects {
+    /// Those below `base`. Its query, if it has one, goes with every request. Sends nothing yet.
+    ///
+    /// # Errors
+    ///
+    /// [`LocationError`] if that is no address of HTTP.
+    pub fn new(base: &str) -> Result<Self, LocationError> {
+        Self::with_patience(base, Patience::default())
+    }
+
+    /// Like [`Self::new`], with other patience.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::new`].
+    pub fn with_patience(base: &str, patience: Patience) -> Result<Self, LocationError> {
+        let wrong = || LocationError::new(base, "it is no address such as https://host/image.zarr");
+        let mut url = Url::parse(base).map_err(|_| wrong())?;
+        if !matches!(url.scheme(), "http" | "https") || !url.has_host() {
+            return Err(wrong());
+        }
+        url.set_fragment(None);
+        Ok(Self {
+            client: platform::client(),
+            base: url,
+            patience,
+            requests: Semaphore::new(REQUESTS),
+            forbids_missing: OnceCell::new(),
+        })
+    }
+
+    fn url(&self, key: &str) -> Url {
+        let mut url = self.base.clone();
+        if let Ok(mut path) = url.path_segments_mut() {
+            path.pop_if_empty().extend(key.split('/'));
+        }
+        url
+    }
+
+    async fn part(&self, key: &str, part: Part) -> Result<Option<Bytes>, ObjectError> {
+        if !is_key(key) {
+            return Err(ObjectError::Key {
+                key: key.to_owned(),
+                location: shown(&self.base),
+            });
+        }
+        if let Part::Range(range) = &part
+            && range.is_empty()
+        {
+            return Ok(Some(Bytes::new()));
+        }
+        let url = self.url(key);
+        let asked = self
+            .patience
+            .attempts(self, key, || self.attempt(&url, &part));
+        match asked.await? {
+            Found::Object(bytes) => Ok(Some(bytes)),
+            Found::Nothing => Ok(None),
+            Found::Forbidden if self.forbids_missing().await? => Ok(None),
+            Found::Forbidden => Err(ObjectError::Denied {
+                advice: "the server wants credentials, or does not allow this object to be read",
+                location: shown(&url),
+            }),
+        }
+    }
+
+    /// Asks, once, for an object that there cannot be.
+    async fn forbids_missing(&self) -> Result<bool, ObjectError> {
+        let ask = async || {
+            let url = self.url(NOBODYS);
+            let part = Part::Whole { most: 1 << 20 };
+            let asked = self
+                .patience
+                .attempts(self, NOBODYS, || self.attempt(&url, &part));
+            let forbids = matches!(asked.await?, Found::Forbidden);
+            if forbids {
+                let base = shown(&self.base);
+                log::warn!(
+                    "forbidden objects are taken for missing ones, as all missing ones are forbidden: {base}"
+                );
+            }
+            Ok(forbids)
+        };
+        self.forbids_missing.get_or_try_init(ask).await.copied()
+    }
+
+    async fn attempt(&self, url: &Url, part: &Part) -> Result<Found, Failure> {
+        // The semaphore is never closed.
+        let _permit = self.requests.acquire().await.ok();
+        let mut request = self.client.get(url.clone());
+        match part {
+            Part::Whole { .. } => {}
+            Part::Range(range) => {
+                let last = range.end - 1;
+                request = request.header(header::RANGE, format!("bytes={}-{last}", range.start));
+            }
+            Part::Last(count) => {
+                request = request.header(header::RANGE, format!("bytes=-{count}"));
+            }
+        }
+        let sent = self.patience.idle(request.send()).await?;
+        let answer = sent.map_err(|error| Failure::again(chain(&error.without_url())))?;
+        let status = answer.status();
+        match status {
+            StatusCode::OK | StatusCode::PARTIAL_CONTENT => {
+                let bytes = answer::read(answer, part, self.patience, &shown(url)).await?;
+                Ok(Found::Object(bytes))
+            }
+            StatusCode::NOT_FOUND | StatusCode::GONE => Ok(Found::Nothing),
+            StatusCode::FORBIDDEN | StatusCode::UNAUTHORIZED => Ok(Found::Forbidden),
+            StatusCode::RANGE_NOT_SATISFIABLE => match part {
+                Part::Range(range) => Err(Failure::Final(ObjectError::TooShort {
+                    wanted: range.clone(),
+                    location: shown(url),
+                })),
+                // The end of an empty object.
+                _ => Ok(Found::Object(Bytes::new())),
+            },
+            StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS => Err(again(&answer)),
+            _ if status.is_server_error() && status != StatusCode::NOT_IMPLEMENTED => {
+                Err(again(&answer))
+            }
+            _ if status.is_redirection() => {
+                let to = answer.headers().get(header::LOCATION);
+                let to = to.and_then(|to| to.to_str().ok()).unwrap_or("nowhere");
+                Err(Failure::Final(ObjectError::Answer {
+                    answer: format!(
+                        "{status} to {to}, which is not followed; give that address if you trust it"
+                    ),
+                    location: shown(url),
+                }))
+            }
+            _ => Err(Failure::Final(ObjectError::Answer {
+                answer: status.to_string(),
+                location: shown(url),
+            })),
+        }
+    }
+}
+
+impl Objects for HttpObjects {
+    fn read<'a>(
+        &'a self,
+        key: &'a str,
+        part: Part,
+    ) -> BoxFuture<'a, Result<Option<Bytes>, ObjectError>> {
+        Box::pin(self.part(key, part))
+    }
+
+    fn location(&self, key: &str) -> String {
+        shown(&self.url(key))
+    }
+
+    fn read_cost(&self) -> u64 {
+        256 << 10
+    }
+}
+
+enum Found {
+    Object(Bytes),
+    Nothing,
+    Forbidden,
+}
+
+fn again(answer: &reqwest::Response) -> Failure {
+    let wait = answer.headers().get(header::RETRY_AFTER);
+    let wait = wait.and_then(|wait| wait.to_str().ok()?.trim().parse().ok());
+    Failure::Again {
+        reason: format!("the server answers {}", answer.status()),
+        wait: wait.map(std::time::Duration::from_secs),
+    }
+}
+
+/// An address without what may be secret: its password, its query.
+fn shown(url: &Url) -> String {
+    let mut url = url.clone();
+    url.set_query(None);
+    // Fails for addresses that have no user anyway.
+    let _ = url.set_password(None).and_then(|()| url.set_username(""));
+    url.into()
+}
+
+pub(super) fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text += ": ";
+        text += &error.to_string();
+        cause = error.source();
+    }
+    text
+}

@@ -1,0 +1,22 @@
+use reqwest::Client;
+use reqwest::redirect::{Attempt, Policy};
+
+/// Follows a server to another place of its own, not to others.
+pub(super) fn client() -> Client {
+    saccade_archive::tls::provide();
+    let own = |attempt: Attempt<'_>| {
+        let first = attempt.previous().first();
+        let same = first.is_some_and(|first| {
+            first.host() == attempt.url().host()
+                && (first.port_or_known_default() == attempt.url().port_or_known_default()
+                    || (first.scheme() == "http" && attempt.url().scheme() == "https"))
+        });
+        if same && attempt.previous().len() < 5 {
+            attempt.follow()
+        } else {
+            attempt.stop()
+        }
+    };
+    let client = Client::builder().redirect(Policy::custom(own));
+    client.build().unwrap_or_default()
+}

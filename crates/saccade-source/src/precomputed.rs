@@ -1,0 +1,162 @@
+//! Neuroglancer's precomputed volumes, wherever [`crate::objects`] reach.
+//!
+//! Chunks may be raw, jpeg, png or `compressed_segmentation`, in objects of their own or in shards, of any number of
+//! levels and channels. Where a store compresses in transport, copies of it in folders are read as well (`NAME.gz`, or
+//! compressed without saying so).
+//!
+//! # Values
+//!
+//! As those of [`crate::zarr`]. Segments whose ids fit into 16 bit keep them; others are scattered over 65535
+//! numbers, which [`PrecomputedSource::notes`] tells: 0 stays nothing, the same id the same number everywhere.
+//!
+//! # Failure
+//!
+//! As that of [`crate::zarr`].
+
+mod decode;
+mod error;
+mod image;
+mod info;
+mod shard;
+#[cfg(all(test, not(target_family = "wasm")))]
+mod tests;
+
+use std::sync::Arc;
+
+use glam::{DVec3, UVec3};
+use saccade_core::brick::MAX_LEVELS;
+use saccade_core::levels::Level;
+use saccade_core::volume::{Dtype, MAX_EXTENT, Volume};
+
+use crate::maybe_send::{BoxFuture, BoxStream};
+use crate::objects::{Objects, Part};
+use crate::stored::{StoredSource, volume_name};
+use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
+pub use error::PrecomputedError;
+use error::Refusal;
+use image::PrecomputedImage;
+use info::Info;
+
+/// Size of the chunks that a volume is read in \[voxels\].
+const CHUNK: UVec3 = UVec3::new(64, 64, 64);
+/// Metadata longer than this are not read \[bytes\].
+const MOST_METADATA: u64 = 16 << 20;
+
+/// A precomputed volume.
+pub struct PrecomputedSource {
+    stored: StoredSource<PrecomputedImage>,
+    notes: Vec<String>,
+}
+
+impl std::fmt::Debug for PrecomputedSource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("PrecomputedSource")
+            .field("volume", self.volume())
+            .finish_non_exhaustive()
+    }
+}
+
+impl PrecomputedSource {
+    /// Opens the volume that some objects are; its name is made from `name`.
+    ///
+    /// # Errors
+    ///
+    /// [`PrecomputedError::NoVolume`] if they are none, others as they occur.
+    pub async fn open(objects: Arc<dyn Objects>, name: &str) -> Result<Self, PrecomputedError> {
+        let read = objects
+            .read(
+                "info",
+                Part::Whole {
+                    most: MOST_METADATA,
+                },
+            )
+            .await;
+        let read = read.map_err(|source| PrecomputedError::Read {
+            source: Arc::new(source),
+        })?;
+        let text = read.ok_or_else(|| PrecomputedError::NoVolume {
+            location: objects.location("info"),
+        })?;
+        let here = |refusal: Refusal| refusal.at(objects.location("info"));
+        let json = serde_json::from_slice(&text);
+        let json = json.map_err(|error| here(Refusal::Wrong(error.to_string())))?;
+        let info = Info::parse(&json).map_err(here)?;
+        let volume = volume(name, &info).map_err(here)?;
+        let mut notes = Vec::new();
+        let offset = info.scales[0].offset;
+        if offset != [0; 3] {
+            let [x, y, z] = offset;
+            notes.push(format!(
+                "its first voxel is {x}, {y}, {z} elsewhere, and 0, 0, 0 here (voxel_offset)"
+            ));
+        }
+        let stored = PrecomputedImage::new(objects, volume, info).await;
+        let stored = stored.map_err(|source| PrecomputedError::Sample { source })?;
+        notes.extend(stored.values().note());
+        let piece = stored.piece_bytes();
+        Ok(Self {
+            stored: StoredSource::new(stored, piece),
+            notes,
+        })
+    }
+
+    /// What a user should know of how the volume is shown, in sentences.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
+    }
+}
+
+impl VolumeSource for PrecomputedSource {
+    fn volume(&self) -> &Arc<Volume> {
+        self.stored.volume()
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        self.stored.read(id)
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.stored.changes()
+    }
+}
+
+/// The volume that an `info` describes.
+fn volume(name: &str, info: &Info) -> Result<Volume, Refusal> {
+    let refused = |reason: String| Refusal::Unsupported(reason);
+    let finest = &info.scales[0];
+    let volume = Volume::new(&volume_name(name), finest.size, finest.resolution);
+    let mut volume = volume.map_err(|error| refused(error.to_string()))?;
+    if info.scales.len() > MAX_LEVELS {
+        let count = info.scales.len();
+        return Err(refused(format!(
+            "it has {count} levels, and {MAX_LEVELS} can be shown"
+        )));
+    }
+    volume.dtype = match info.number.bytes() {
+        1 => Dtype::Uint8,
+        _ => Dtype::Uint16,
+    };
+    volume.chunk = CHUNK;
+    volume.channels = (0..info.channels).map(|n| format!("channel {n}")).collect();
+    volume.levels.clear();
+    for scale in &info.scales {
+        if scale.size.max_element() > MAX_EXTENT {
+            let size = scale.size;
+            return Err(refused(format!(
+                "{size} voxels are more than {MAX_EXTENT} along an axis"
+            )));
+        }
+        volume.levels.push(Level {
+            extent: scale.size,
+            downsampling: (scale.resolution / finest.resolution).max(DVec3::ONE),
+        });
+    }
+    let coarser = volume.levels.windows(2).all(|pair| {
+        pair[1].downsampling.cmpge(pair[0].downsampling).all()
+            && pair[1].extent.cmple(pair[0].extent).all()
+    });
+    if !coarser {
+        return Err(refused("its levels are not from fine to coarse".to_owned()));
+    }
+    Ok(volume)
+}

@@ -1,0 +1,162 @@
+//! Numbers of a chunk, from its bytes.
+
+use std::io::Cursor;
+
+use bytes::Bytes;
+use glam::UVec3;
+use image::codecs::jpeg::JpegDecoder;
+use image::codecs::png::PngDecoder;
+use image::{ExtendedColorType, ImageDecoder};
+
+use super::info::Encoding;
+use crate::codecs::{Codec, Damage};
+use crate::values::Number;
+
+/// What a chunk should hold.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Shape {
+    /// \[voxels\]
+    pub(super) size: UVec3,
+    pub(super) channels: u32,
+    pub(super) number: Number,
+}
+
+impl Shape {
+    fn voxels(self) -> usize {
+        self.size.as_usizevec3().element_product()
+    }
+
+    /// Bytes of all its numbers.
+    pub(super) fn bytes(self) -> usize {
+        self.voxels() * self.channels as usize * self.number.bytes()
+    }
+}
+
+/// Numbers in the order x, y, z, channel, the first fastest, little-endian.
+pub(super) fn decode(encoding: Encoding, shape: Shape, mut bytes: Bytes) -> Result<Bytes, Damage> {
+    let want = shape.bytes();
+    // Stores that compress in transport are copied to folders as they are.
+    let zipped = bytes.starts_with(&[0x1f, 0x8b, 8]);
+    if zipped && !(encoding == Encoding::Raw && bytes.len() == want) {
+        bytes = Codec::Gzip.decode(bytes, want + want / 4 + (64 << 10))?;
+    }
+    match encoding {
+        Encoding::Raw => {}
+        Encoding::Jpeg => {
+            let decoder = JpegDecoder::new(Cursor::new(&*bytes));
+            bytes = picture(decoder.map_err(damage)?, shape)?;
+        }
+        Encoding::Png => {
+            let decoder = PngDecoder::new(Cursor::new(&*bytes));
+            bytes = picture(decoder.map_err(damage)?, shape)?;
+        }
+        Encoding::CompressedSegmentation(block) => bytes = segmentation(&bytes, shape, block)?,
+    }
+    if bytes.len() == want {
+        Ok(bytes)
+    } else {
+        Err(format!(
+            "it has {} bytes of voxels instead of {want}",
+            bytes.len()
+        ))
+    }
+}
+
+fn damage(error: image::ImageError) -> Damage {
+    format!("its picture does not decode: {error}")
+}
+
+/// Pixels of a picture, channel after channel.
+fn picture(decoder: impl ImageDecoder, shape: Shape) -> Result<Bytes, Damage> {
+    let (width, height) = decoder.dimensions();
+    let pixels = u64::from(width) * u64::from(height);
+    if pixels != shape.voxels() as u64 {
+        let voxels = shape.size;
+        return Err(format!(
+            "its picture has {width} x {height} pixels for {voxels} voxels"
+        ));
+    }
+    let color = decoder.color_type();
+    let (channels, width) = (usize::from(color.channel_count()), shape.number.bytes());
+    let deep = matches!(ExtendedColorType::from(color).bits_per_pixel(), bits if usize::from(bits) == channels * width * 8);
+    if channels != shape.channels as usize || !deep {
+        return Err(format!(
+            "its picture is {color:?} for {} channels of {}",
+            shape.channels, shape.number
+        ));
+    }
+    let mut mixed = vec![0; shape.bytes()];
+    decoder.read_image(&mut mixed).map_err(damage)?;
+    if width == 2 {
+        for value in mixed.as_chunks_mut::<2>().0 {
+            *value = u16::from_ne_bytes(*value).to_le_bytes();
+        }
+    }
+    if channels == 1 {
+        return Ok(mixed.into());
+    }
+    let mut planes = Vec::with_capacity(mixed.len());
+    for channel in 0..channels {
+        for pixel in mixed.chunks_exact(channels * width) {
+            planes.extend_from_slice(&pixel[channel * width..][..width]);
+        }
+    }
+    Ok(planes.into())
+}
+
+/// Blocks that have a table each, and voxels that are numbers of entries in it.
+fn segmentation(bytes: &[u8], shape: Shape, block: UVec3) -> Result<Bytes, Damage> {
+    let (words, rest) = bytes.as_chunks::<4>();
+    if !rest.is_empty() {
+        return Err("its length is no multiple of 4".to_owned());
+    }
+    let word = |at: usize| -> Result<u32, Damage> {
+        let word = words.get(at).ok_or("it points behind its end")?;
+        Ok(u32::from_le_bytes(*word))
+    };
+    let index =
+        |number: u32| usize::try_from(number).map_err(|_| "its numbers are too large".to_owned());
+    let wide = shape.number.bytes() == 8;
+    let [nx, ny, nz] = shape.size.to_array().map(|n| n as usize);
+    let [bx, by, bz] = block.to_array().map(|n| n as usize);
+    let [gx, gy] = [nx.div_ceil(bx), ny.div_ceil(by)];
+    let mut numbers = vec![0; shape.bytes()];
+    let width = shape.number.bytes();
+    for channel in 0..shape.channels as usize {
+        let start = index(word(channel)?)?;
+        let plane = channel * nx * ny * nz;
+        for z in 0..nz {
+            for y in 0..ny {
+                for first in (0..nx).step_by(bx) {
+                    let number = ((z / bz) * gy + y / by) * gx + first / bx;
+                    let head = word(start + number * 2)?;
+                    let (table, bits) = (start + index(head & 0xff_ffff)?, head >> 24);
+                    let values = start + index(word(start + number * 2 + 1)?)?;
+                    if !matches!(bits, 0 | 1 | 2 | 4 | 8 | 16 | 32) {
+                        return Err(format!("a block has {bits} bits per voxel"));
+                    }
+                    let mask = u32::MAX.unbounded_shr(32 - bits);
+                    let row = ((z % bz) * by + y % by) * bx;
+                    let to = plane + (z * ny + y) * nx + first;
+                    let count = bx.min(nx - first);
+                    let to = &mut numbers[to * width..][..count * width];
+                    for (n, to) in to.chunks_exact_mut(width).enumerate() {
+                        let bit = (row + n) * bits as usize;
+                        let entry = match bits {
+                            0 => 0,
+                            _ => word(values + bit / 32)? >> (bit % 32) & mask,
+                        };
+                        let entry = index(entry)?;
+                        if wide {
+                            to[..4].copy_from_slice(&word(table + entry * 2)?.to_le_bytes());
+                            to[4..].copy_from_slice(&word(table + entry * 2 + 1)?.to_le_bytes());
+                        } else {
+                            to.copy_from_slice(&word(table + entry)?.to_le_bytes());
+                        }
+                    }
+                }
+            }
+        }
+    }
+    Ok(numbers.into())
+}

@@ -1,0 +1,334 @@
+//! Volumes that tensorstore wrote (`fixtures/write.py`), voxel by voxel, and what is not right.
+#![expect(clippy::unwrap_used, reason = "helpers of tests")]
+
+use std::path::{Path, PathBuf};
+
+use saccade_core::voxel_box::VoxelBox;
+use serde_json::{Value, json};
+
+use super::*;
+use crate::conformance::{check_reading, check_volume};
+use crate::objects::{FolderObjects, HttpObjects, MemoryObjects, Patience};
+use crate::test_server::{Fault, TestServer};
+
+const SIZE: UVec3 = UVec3::new(45, 31, 11);
+
+fn fixture(name: &str) -> PathBuf {
+    let fixtures = "src/precomputed/tests/fixtures";
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join(fixtures)
+        .join(name)
+}
+
+async fn open(name: &str) -> PrecomputedSource {
+    let objects = FolderObjects::new(&fixture(name));
+    PrecomputedSource::open(Arc::new(objects), name)
+        .await
+        .unwrap()
+}
+
+/// The script's `busy`, `smooth` and `blocks`.
+fn busy(at: UVec3, channel: u32) -> u32 {
+    1 + (7 * at.x + 131 * at.y + 1009 * at.z + 17 * channel) % 250
+}
+
+fn smooth(at: UVec3, channel: u32) -> u32 {
+    40 + 2 * at.x + at.y + 3 * at.z + 20 * channel
+}
+
+fn blocks(at: UVec3, channel: u32) -> u32 {
+    (at.x / 7 + 3 * (at.y / 5) + 11 * (at.z / 3)) % 40 * (1 + channel)
+}
+
+/// A chunk of values that follow from positions.
+fn chunk(volume: &Volume, id: ChunkId, value: impl Fn(UVec3, u32) -> u32) -> Vec<u8> {
+    let min = id.chunk * volume.chunk;
+    let extent = volume.levels[id.level as usize].extent;
+    let all = VoxelBox::new(min, min + volume.chunk);
+    let bytes = all.iter().flat_map(|at| {
+        let value = if at.cmplt(extent).all() {
+            value(at, id.channel)
+        } else {
+            0
+        };
+        value.to_le_bytes().into_iter().take(volume.dtype.bytes())
+    });
+    bytes.collect()
+}
+
+#[tokio::test]
+async fn voxels_are_those_that_were_written() {
+    type Formula = fn(UVec3, u32) -> u32;
+    let cases: [(&str, Formula, usize); 6] = [
+        ("raw", busy, 1),
+        ("raw_sharded", |at, c| busy(at, c) * 200, 2),
+        ("png", busy, 1),
+        ("png_deep", |at, c| busy(at, c) * 200, 1),
+        ("segments", blocks, 1),
+        ("segments_sharded", blocks, 2),
+    ];
+    for (name, formula, channels) in cases {
+        let source = open(name).await;
+        let volume = source.volume().clone();
+        check_volume(&volume).unwrap();
+        assert_eq!(
+            (volume.extent(), volume.channels.len()),
+            (SIZE, channels),
+            "{name}"
+        );
+        assert_eq!(volume.voxel_nm, DVec3::new(8.0, 8.0, 40.0));
+        check_reading(&source, |id| chunk(&volume, id, formula), 0)
+            .await
+            .unwrap();
+        let wrong = |id| chunk(&volume, id, |at, c| formula(at + UVec3::X, c));
+        assert!(check_reading(&source, wrong, 0).await.is_err(), "{name}");
+    }
+}
+
+#[tokio::test]
+async fn levels_and_first_voxels_are_as_the_info_says() {
+    let source = open("raw").await;
+    let level = source.volume().levels[1];
+    assert_eq!(level.extent, UVec3::new(23, 16, 11));
+    assert_eq!(level.downsampling, DVec3::new(2.0, 2.0, 1.0));
+    assert!(
+        source.notes()[0].contains("100, -20, 3"),
+        "{:?}",
+        source.notes()
+    );
+}
+
+#[tokio::test]
+async fn pictures_that_lose_a_little_lose_a_little() {
+    for (name, channels) in [("jpeg", 1), ("jpeg_colour", 3)] {
+        let source = open(name).await;
+        let volume = source.volume().clone();
+        let mut furthest = 0;
+        for channel in 0..channels {
+            let id = ChunkId {
+                channel,
+                level: 0,
+                chunk: UVec3::ZERO,
+            };
+            let Chunk::Voxels(bytes) = source.read(id).await.unwrap() else {
+                panic!("{name} is empty");
+            };
+            for (got, want) in bytes.iter().zip(chunk(&volume, id, smooth)) {
+                furthest = furthest.max(got.abs_diff(want));
+            }
+        }
+        // Colours are stored as differences; neighbours in another order would be 60 away.
+        assert!(
+            furthest <= if channels == 1 { 2 } else { 8 },
+            "{name}: {furthest}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn large_names_and_fractions_are_fitted_and_told() {
+    let source = open("segments_large").await;
+    assert!(
+        source.notes()[0].contains("names of things"),
+        "{:?}",
+        source.notes()
+    );
+    let id = ChunkId {
+        channel: 0,
+        level: 0,
+        chunk: UVec3::ZERO,
+    };
+    let Chunk::Voxels(bytes) = source.read(id).await.unwrap() else {
+        panic!("it is empty");
+    };
+    let shown = bytes
+        .as_chunks::<2>()
+        .0
+        .iter()
+        .map(|two| u16::from_le_bytes(*two));
+    let mut of_name = std::collections::BTreeMap::new();
+    let ids = chunk(source.volume(), id, blocks);
+    for (shown, name) in shown.zip(ids.as_chunks::<2>().0) {
+        assert_eq!(
+            *of_name.entry(*name).or_insert(shown),
+            shown,
+            "a thing has one number"
+        );
+    }
+    let numbers: std::collections::BTreeSet<u16> = of_name.values().copied().collect();
+    assert_eq!(
+        (of_name[&[0, 0]], numbers.len()),
+        (0, 40),
+        "nothing is nothing, and things differ"
+    );
+
+    let source = open("floats").await;
+    let Chunk::Voxels(bytes) = source.read(id).await.unwrap() else {
+        panic!("it is empty");
+    };
+    // From 0.25 to 62.5 in 65535 steps.
+    let step = (250.0 - 1.0) / 65_534.0;
+    let wanted = chunk(source.volume(), id, busy);
+    for (shown, want) in bytes
+        .as_chunks::<2>()
+        .0
+        .iter()
+        .zip(wanted.as_chunks::<2>().0)
+    {
+        let (shown, want) = (u16::from_le_bytes(*shown), u16::from_le_bytes(*want));
+        let back = (f64::from(shown) - 1.0) * step + 1.0;
+        assert!(
+            want == 0 || (back - f64::from(want)).abs() <= step,
+            "{shown} for {want}"
+        );
+    }
+}
+
+fn info() -> Value {
+    json!({"@type": "neuroglancer_multiscale_volume", "type": "image", "data_type": "uint8", "num_channels": 1,
+        "scales": [{"key": "s", "size": [4, 4, 4], "chunk_sizes": [[4, 4, 4]], "resolution": [1, 1, 1],
+        "encoding": "raw", "voxel_offset": [0, 0, 0]}]})
+}
+
+#[tokio::test]
+async fn what_cannot_be_shown_is_refused_in_words() {
+    let sharding = |name: &str, value: Value| {
+        let mut sharding = json!({"@type": "neuroglancer_uint64_sharded_v1", "preshift_bits": 9, "hash": "identity",
+            "minishard_bits": 6, "shard_bits": 15});
+        sharding[name] = value;
+        sharding
+    };
+    for (pointer, value, words) in [
+        ("/@type", json!("neuroglancer_skeletons"), "only volumes"),
+        ("/data_type", json!("complex64"), "complex64"),
+        ("/num_channels", json!(0), "channels"),
+        ("/scales", json!([]), "levels"),
+        ("/scales/0/key", json!("../s"), "outside"),
+        ("/scales/0/size", json!([4, 0, 4]), "size"),
+        ("/scales/0/size", json!([1e12, 4, 4]), "size"),
+        ("/scales/0/resolution", json!([1, -1, 1]), "no size"),
+        ("/scales/0/chunk_sizes", json!([]), "chunk size"),
+        ("/scales/0/encoding", json!("compresso"), "compresso"),
+        (
+            "/scales/0/encoding",
+            json!("compressed_segmentation"),
+            "uint32",
+        ),
+        ("/scales/0/sharding", sharding("hash", json!("md5")), "md5"),
+        (
+            "/scales/0/sharding",
+            sharding("minishard_bits", json!(61)),
+            "minishard_bits",
+        ),
+        (
+            "/scales/0/sharding",
+            sharding("shard_bits", json!(60)),
+            "64 bits",
+        ),
+    ] {
+        let mut info = info();
+        if pointer.ends_with("sharding") {
+            info["scales"][0]["sharding"] = Value::Null;
+        }
+        *info.pointer_mut(pointer).unwrap() = value;
+        let objects: MemoryObjects = [("info".to_owned(), info.to_string().into())]
+            .into_iter()
+            .collect();
+        let error = PrecomputedSource::open(Arc::new(objects), "x")
+            .await
+            .unwrap_err();
+        assert!(error.to_string().contains(words), "{words}: {error}");
+    }
+    let mut large = info();
+    large["scales"][0]["size"] = json!([70_000, 70_000, 70_000]);
+    large["scales"][0]["chunk_sizes"] = json!([[70_000, 70_000, 70_000]]);
+    let objects: MemoryObjects = [("info".to_owned(), large.to_string().into())]
+        .into_iter()
+        .collect();
+    let error = PrecomputedSource::open(Arc::new(objects), "x")
+        .await
+        .unwrap_err();
+    assert!(error.to_string().contains("too large"), "{error}");
+}
+
+/// Whatever a server sends, there are the right voxels or an error that names the chunk.
+#[tokio::test]
+async fn damage_is_told_and_what_passes_is_read_again() {
+    let patience = Patience {
+        attempts: 2,
+        first_wait: std::time::Duration::from_millis(5),
+        ..Patience::default()
+    };
+    let id = ChunkId {
+        channel: 0,
+        level: 0,
+        chunk: UVec3::ZERO,
+    };
+    for (name, object) in [
+        ("png", "s0/0.shard"),
+        ("segments", "s0/0-16_0-13_0-5"),
+        ("segments_sharded", "s0/0.shard"),
+        ("jpeg", "s0/0-16_0-13_0-5"),
+    ] {
+        let server = TestServer::of_folder(&fixture(name)).await;
+        let open = async || {
+            let objects = HttpObjects::with_patience(&server.url, patience).unwrap();
+            PrecomputedSource::open(Arc::new(objects), name)
+                .await
+                .unwrap()
+        };
+        let good = open().await.read(id).await.unwrap();
+        for fault in [Fault::Garbage, Fault::Cut, Fault::Reset] {
+            let source = open().await;
+            server.fail_next([fault]);
+            assert!(source.read(id).await.unwrap() == good, "{name} {fault:?}");
+            let source = open().await;
+            server.fail_always(object, fault);
+            let error = source.read(id).await.unwrap_err();
+            let mut text = error.to_string();
+            let mut cause = std::error::Error::source(&error);
+            while let Some(error) = cause {
+                text += &format!(": {error}");
+                cause = error.source();
+            }
+            assert!(
+                text.contains("of level 0") && text.contains(object),
+                "{name} {fault:?}: {text}"
+            );
+            server.always.lock().unwrap().clear();
+        }
+    }
+}
+
+/// Segmentations of a real brain by cloud-volume and tensorstore, if they are there.
+#[tokio::test]
+async fn real_volumes_open() {
+    let data =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/derived-refwriters/dev");
+    for (name, extent) in [
+        ("precomputed_gray_raw_unsharded", UVec3::new(140, 135, 130)),
+        ("precomputed_seg_cseg_sharded", UVec3::splat(250)),
+        ("precomputed_pinky40_16nm_cseg_u32_gz", UVec3::splat(512)),
+    ] {
+        let folder = data.join(name);
+        if !folder.is_dir() {
+            return;
+        }
+        let source = PrecomputedSource::open(Arc::new(FolderObjects::new(&folder)), name)
+            .await
+            .unwrap();
+        assert_eq!(source.volume().extent(), extent, "{name}");
+        let mut seen = 0;
+        for chunk in VoxelBox::of_size(source.volume().chunks(0)).iter().take(8) {
+            let id = ChunkId {
+                channel: 0,
+                level: 0,
+                chunk,
+            };
+            if let Chunk::Voxels(bytes) = source.read(id).await.unwrap() {
+                seen += bytes.iter().filter(|byte| **byte != 0).count();
+            }
+        }
+        assert!(seen > 100_000, "{name}: {seen} bytes are not 0");
+    }
+}

@@ -1,0 +1,251 @@
+//! Images that lie somewhere in chunks of their own, read as chunks of a volume.
+//!
+//! A chunk of ours may touch many of theirs, and one of theirs many of ours. Each of theirs is read and decoded
+//! once for all who want it, kept while there is room, and given up when nobody waits any more.
+
+mod piece;
+#[cfg(not(target_family = "wasm"))]
+#[path = "stored/native.rs"]
+mod platform;
+#[cfg(target_family = "wasm")]
+#[path = "stored/wasm.rs"]
+mod platform;
+mod sample;
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+
+use crate::flights::{Flights, Weighed, Work};
+use crate::maybe_send::{BoxFuture, BoxStream, MaybeSend, MaybeSync};
+use crate::objects::ObjectError;
+use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
+
+pub(crate) use piece::{Place, copy, fill};
+pub(crate) use platform::compute;
+pub(crate) use sample::{Sample, sampled};
+
+/// Decoded chunks that are kept, all levels together \[bytes\].
+const CACHE_BYTES: u64 = 512 << 20;
+/// Longest range that is read at once \[bytes\], unless a single chunk is longer.
+const MOST_AT_ONCE: u64 = 8 << 20;
+
+/// One of the image's own chunks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct PieceId {
+    /// Level.
+    pub(crate) level: u32,
+    /// Number within the level, in an order of the format's.
+    pub(crate) number: u64,
+}
+
+/// What it holds.
+#[derive(Clone, Debug)]
+pub(crate) enum Piece {
+    /// This value everywhere.
+    Uniform(u16),
+    /// Values of the volume's type.
+    Values(Bytes),
+}
+
+impl Weighed for Piece {
+    fn bytes(&self) -> u64 {
+        match self {
+            Self::Uniform(_) => 0,
+            Self::Values(bytes) => bytes.len() as u64,
+        }
+    }
+}
+
+/// Why one cannot be read.
+#[derive(Clone, Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum PieceError {
+    /// Its object cannot be read.
+    #[error("{which} cannot be read")]
+    Unread {
+        /// What went wrong.
+        source: Arc<ObjectError>,
+        /// The chunk, as its format counts.
+        which: String,
+    },
+    /// What was read is no chunk.
+    #[error("{which} is damaged: {reason}: {location}")]
+    Damaged {
+        /// What is wrong with it.
+        reason: String,
+        /// The chunk, as its format counts.
+        which: String,
+        /// Its object.
+        location: String,
+    },
+}
+
+impl PieceError {
+    fn is_transient(&self) -> bool {
+        match self {
+            Self::Unread { source, .. } => source.is_transient(),
+            Self::Damaged { .. } => false,
+        }
+    }
+}
+
+/// Work on pieces, by their ids.
+pub(crate) type Pieces = Work<PieceId, Piece, PieceError>;
+
+/// A format of stored images.
+pub(crate) trait Stored: MaybeSend + MaybeSync + 'static {
+    /// What the image is.
+    fn volume(&self) -> &Arc<Volume>;
+
+    /// The pieces that a box of voxels touches, and where each has its voxels.
+    fn touched(&self, channel: u32, level: u32, voxels: VoxelBox) -> Vec<(PieceId, Place)>;
+
+    /// Reads pieces, in groups that are best read together.
+    fn read(self: &Arc<Self>, pieces: Vec<PieceId>) -> Vec<(Vec<PieceId>, Pieces)>;
+}
+
+/// A stored image as a source.
+pub(crate) struct StoredSource<F> {
+    format: Arc<F>,
+    pieces: Arc<Flights<PieceId, Piece, PieceError>>,
+}
+
+impl<F: Stored> StoredSource<F> {
+    /// `piece_bytes` is about what a decoded piece takes.
+    pub(crate) fn new(format: F, piece_bytes: u64) -> Self {
+        Self {
+            format: Arc::new(format),
+            pieces: Flights::new(CACHE_BYTES, piece_bytes),
+        }
+    }
+
+    async fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
+        let volume = self.format.volume();
+        let voxels = id.voxels(volume).ok_or(ChunkError::OutOfRange { id })?;
+        let touched = self.format.touched(id.channel, id.level, voxels);
+        let ids: Vec<PieceId> = touched.iter().map(|(piece, _)| *piece).collect();
+        let pieces = self
+            .pieces
+            .get(&ids, |missing| self.format.read(missing))
+            .await;
+        let mut found = Vec::with_capacity(pieces.len());
+        for (piece, (_, place)) in pieces.into_iter().zip(touched) {
+            match piece {
+                Some(Ok(Piece::Uniform(0))) => {}
+                Some(Ok(piece)) => found.push((piece, place)),
+                Some(Err(error)) => {
+                    return Err(ChunkError::Failed {
+                        id,
+                        transient: error.is_transient(),
+                        source: Arc::new(error),
+                    });
+                }
+                // Every group has an outcome for each of its keys.
+                None => return Err(unfinished(id)),
+            }
+        }
+        if found.is_empty() {
+            return Ok(Chunk::Empty);
+        }
+        let (size, width) = (volume.chunk, volume.dtype.bytes());
+        let mut bytes = vec![0; size.as_usizevec3().element_product() * width];
+        for (piece, place) in &found {
+            match piece {
+                Piece::Uniform(value) => fill(*value, place, voxels, &mut bytes, size, width),
+                Piece::Values(values) => copy(values, place, voxels, &mut bytes, size, width),
+            }
+        }
+        if bytes.iter().all(|&byte| byte == 0) {
+            Ok(Chunk::Empty)
+        } else {
+            Ok(Chunk::Voxels(bytes.into()))
+        }
+    }
+}
+
+fn unfinished(id: ChunkId) -> ChunkError {
+    ChunkError::Failed {
+        id,
+        transient: true,
+        source: Arc::new(PieceError::Damaged {
+            reason: "its reading ended without a result".to_owned(),
+            which: "a chunk".to_owned(),
+            location: String::new(),
+        }),
+    }
+}
+
+impl<F: Stored> VolumeSource for StoredSource<F> {
+    fn volume(&self) -> &Arc<Volume> {
+        self.format.volume()
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        Box::pin(self.chunk(id))
+    }
+
+    /// Nobody tells of changes in files.
+    fn changes(&self) -> BoxStream<'static, Change> {
+        Box::pin(futures::stream::pending())
+    }
+}
+
+/// A name for addresses, from that of a folder.
+pub(crate) fn volume_name(name: &str) -> String {
+    let name = name.trim_end_matches(".zarr").trim_end_matches(".ome");
+    let allowed = |c: char| {
+        if c.is_ascii_alphanumeric() || "-_.".contains(c) {
+            c
+        } else {
+            '-'
+        }
+    };
+    let name: String = name.chars().map(allowed).take(100).collect();
+    match name.trim_start_matches('.') {
+        "" => "image".to_owned(),
+        name => name.to_owned(),
+    }
+}
+
+/// Ranges of an object that are better read together: each with the numbers of those it covers.
+///
+/// `gap` bytes between two cost less than another request.
+pub(crate) fn coalesced(ranges: &[Range<u64>], gap: u64) -> Vec<(Range<u64>, Vec<usize>)> {
+    let mut order: Vec<usize> = (0..ranges.len()).collect();
+    order.sort_by_key(|&n| (ranges[n].start, ranges[n].end));
+    let mut merged: Vec<(Range<u64>, Vec<usize>)> = Vec::new();
+    for n in order {
+        let range = &ranges[n];
+        if let Some((last, numbers)) = merged.last_mut()
+            && range.start <= last.end.saturating_add(gap)
+            && range.end.saturating_sub(last.start) <= MOST_AT_ONCE
+        {
+            last.end = last.end.max(range.end);
+            numbers.push(n);
+        } else {
+            merged.push((range.clone(), vec![n]));
+        }
+    }
+    merged
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn neighbours_are_read_together_and_strangers_are_not() {
+        let ranges = [100..200, 0..50, 210..300, 5000..6000, 40..90];
+        let merged = coalesced(&ranges, 10);
+        assert_eq!(merged, [(0..300, vec![1, 4, 0, 2]), (5000..6000, vec![3])]);
+        let long = [0..MOST_AT_ONCE, MOST_AT_ONCE..MOST_AT_ONCE + 1];
+        assert_eq!(coalesced(&long, 10).len(), 2);
+        let far = [u64::MAX - 1..u64::MAX, 0..1];
+        assert_eq!(coalesced(&far, 10).len(), 2);
+        assert_eq!(coalesced(&[], 10), []);
+    }
+}

@@ -1,0 +1,538 @@
+//! The voxels of an image: which chunks of its arrays they are in, and how those are read.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use futures::StreamExt as _;
+use futures::stream;
+use glam::UVec3;
+use saccade_core::volume::Volume;
+use saccade_core::voxel_box::VoxelBox;
+
+use super::array::Array;
+use super::error::{Refusal, ZarrError};
+use super::metadata::{Axis, Image};
+use super::shard::Index;
+use crate::codecs::Damage;
+use crate::flights::{Flights, Work};
+use crate::objects::{Objects, Part};
+use crate::stored::{
+    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, compute, sampled,
+};
+use crate::values::{Number, Values};
+
+/// Indices of shards that are kept \[bytes\].
+const INDEX_CACHE: u64 = 64 << 20;
+/// Ranges of a shard that are read at once.
+const RANGES_AT_ONCE: usize = 8;
+
+/// A level: an array whose axes are known.
+#[derive(Debug)]
+pub(super) struct LevelArray {
+    path: String,
+    array: Arc<Array>,
+    axes: Vec<Axis>,
+    grid: Vec<u64>,
+    extent: UVec3,
+    channels: u32,
+    /// Values between neighbours along each axis of the array, in a decoded chunk.
+    strides: Vec<usize>,
+}
+
+impl LevelArray {
+    pub(super) fn new(path: &str, array: Array, axes: &[Axis]) -> Result<Self, Refusal> {
+        if array.shape.len() != axes.len() {
+            let (got, named) = (array.shape.len(), axes.len());
+            return Err(Refusal::Wrong(format!(
+                "it has {got} axes, and {named} have names"
+            )));
+        }
+        let mut extent = UVec3::ONE;
+        let mut channels = 1;
+        for (axis, &length) in axes.iter().zip(&array.shape) {
+            let length = u32::try_from(length);
+            let length = length.map_err(|_| Refusal::wrong("an axis is far too long"))?;
+            match axis {
+                Axis::T => {}
+                Axis::C => channels = length,
+                Axis::Space(axis) => extent[*axis] = length,
+            }
+        }
+        let mut strides = vec![0; axes.len()];
+        let mut stride = 1;
+        for &axis in array.encoding.order.iter().rev() {
+            strides[axis] = stride;
+            stride *= usize::try_from(array.chunk[axis]).map_err(Refusal::wrong)?;
+        }
+        Ok(Self {
+            path: path.to_owned(),
+            grid: array.grid(),
+            array: Arc::new(array),
+            axes: axes.to_vec(),
+            extent,
+            channels,
+            strides,
+        })
+    }
+
+    pub(super) fn extent(&self) -> UVec3 {
+        self.extent
+    }
+
+    pub(super) fn channels(&self) -> u32 {
+        self.channels
+    }
+
+    pub(super) fn number(&self) -> Number {
+        self.array.number
+    }
+
+    /// Chunks that a box of a channel touches: their numbers, and where they have their voxels.
+    fn touched(&self, channel: u32, voxels: VoxelBox) -> Vec<(u64, Place)> {
+        let mut index = vec![0; self.axes.len()];
+        let mut offset = 0;
+        let (mut strides, mut cell, mut spatial) = ([0; 3], [1_u64; 3], [None; 3]);
+        for (n, axis) in self.axes.iter().enumerate() {
+            let chunk = self.array.chunk[n];
+            match axis {
+                Axis::T => {}
+                Axis::C => {
+                    index[n] = u64::from(channel) / chunk;
+                    let inside = u64::from(channel) % chunk;
+                    offset = usize::try_from(inside).expect("within a chunk") * self.strides[n];
+                }
+                Axis::Space(axis) => {
+                    strides[*axis] = self.strides[n];
+                    cell[*axis] = chunk;
+                    spatial[*axis] = Some(n);
+                }
+            }
+        }
+        let cells = |axis: usize| {
+            let (min, max) = (u64::from(voxels.min[axis]), u64::from(voxels.max[axis]));
+            min / cell[axis]..max.div_ceil(cell[axis])
+        };
+        let mut touched = Vec::new();
+        for z in cells(2) {
+            for y in cells(1) {
+                for x in cells(0) {
+                    let at = [x, y, z];
+                    let edge = |axis: usize, more: u64| {
+                        let edge = (at[axis] + more).saturating_mul(cell[axis]);
+                        u32::try_from(edge)
+                            .unwrap_or(u32::MAX)
+                            .min(self.extent[axis])
+                    };
+                    let corner = |more| UVec3::new(edge(0, more), edge(1, more), edge(2, more));
+                    for (axis, n) in spatial.iter().enumerate() {
+                        if let Some(n) = n {
+                            index[*n] = at[axis];
+                        }
+                    }
+                    let place = Place {
+                        voxels: VoxelBox::new(corner(0), corner(1)),
+                        strides,
+                        offset,
+                    };
+                    touched.push((ravel(&index, &self.grid), place));
+                }
+            }
+        }
+        touched
+    }
+}
+
+/// The number of an index, last axis fastest.
+fn ravel(index: &[u64], counts: &[u64]) -> u64 {
+    index
+        .iter()
+        .zip(counts)
+        .fold(0, |number, (at, count)| number * count + at)
+}
+
+fn unravel(mut number: u64, counts: &[u64]) -> Vec<u64> {
+    let mut index = vec![0; counts.len()];
+    for (at, count) in index.iter_mut().zip(counts).rev() {
+        *at = number % count;
+        number /= count;
+    }
+    index
+}
+
+/// A shard, by level and number within it.
+type ShardId = (u32, u64);
+type Raw = Result<Option<Bytes>, PieceError>;
+
+/// An open image.
+pub(super) struct ZarrImage {
+    objects: Arc<dyn Objects>,
+    volume: Arc<Volume>,
+    levels: Vec<LevelArray>,
+    values: Arc<Values>,
+    indices: Arc<Flights<ShardId, Option<Index>, PieceError>>,
+}
+
+impl ZarrImage {
+    pub(super) async fn new(
+        objects: Arc<dyn Objects>,
+        volume: Volume,
+        levels: Vec<LevelArray>,
+        metadata: &Image,
+    ) -> Result<Self, ZarrError> {
+        // Levels have the same type; in foreign files not always the same order of bytes.
+        let finest = &levels[0].array;
+        let (number, big_endian) = (finest.number, finest.encoding.big_endian);
+        if levels
+            .iter()
+            .any(|level| level.array.encoding.big_endian != big_endian)
+            && number.bytes() > 1
+        {
+            let refusal =
+                Refusal::Unsupported("its levels differ in the order of their bytes".to_owned());
+            return Err(refusal.at(objects.location("")));
+        }
+        let index = levels
+            .iter()
+            .filter_map(|level| level.array.sharding.as_ref());
+        let index = index
+            .map(super::array::Sharding::index_bytes)
+            .max()
+            .unwrap_or(1);
+        let mut image = Self {
+            objects,
+            volume: Arc::new(volume),
+            levels,
+            values: Arc::new(Values::fitted(number, big_endian, None, false)),
+            indices: Flights::new(INDEX_CACHE.max(index * 2), index),
+        };
+        image.values = Arc::new(match Values::kept(number, big_endian) {
+            Some(kept) => kept,
+            None => {
+                let sample = image.sample().await;
+                let sample = sample.map_err(|source| ZarrError::Sample { source })?;
+                let declared = metadata
+                    .channels
+                    .iter()
+                    .flat_map(|c| [c.window, c.whole])
+                    .flatten();
+                sample.values(number, big_endian, metadata.is_labels, declared)
+            }
+        });
+        Ok(image)
+    }
+
+    pub(super) fn values(&self) -> &Values {
+        &self.values
+    }
+
+    /// About what a decoded chunk takes \[bytes\].
+    pub(super) fn piece_bytes(&self) -> u64 {
+        self.levels[0].array.chunk_bytes() as u64
+    }
+
+    /// Some values of the coarsest level, of all channels.
+    async fn sample(&self) -> Result<Sample, PieceError> {
+        let level = self.levels.len() - 1;
+        let array = &self.levels[level];
+        let whole = VoxelBox::of_size(array.extent);
+        let touched = (0..array.channels.min(16)).flat_map(|channel| array.touched(channel, whole));
+        let all: Vec<(u64, Place)> = touched.collect();
+        let (chosen, partial) = sampled(&all, array.array.chunk_bytes());
+        let mut sample = Sample::new(partial || level > 0);
+        let number = array.number();
+        for (piece, place) in chosen {
+            let id = PieceId {
+                level: u32::try_from(level).unwrap_or(0),
+                number: piece,
+            };
+            let raw = self.raw(id.level, vec![id], None).await;
+            for (_, raw) in raw {
+                if let Some(bytes) = raw? {
+                    sample.add(&bytes, &place, number, array.array.encoding.big_endian);
+                }
+            }
+        }
+        Ok(sample)
+    }
+
+    /// How messages name a chunk.
+    fn which(&self, id: PieceId) -> String {
+        let level = &self.levels[id.level as usize];
+        let index = unravel(id.number, &level.grid);
+        format!("chunk {index:?} of level {}", id.level)
+    }
+
+    fn damaged(&self, id: PieceId, key: &str, reason: Damage) -> PieceError {
+        PieceError::Damaged {
+            reason,
+            which: self.which(id),
+            location: self.objects.location(key),
+        }
+    }
+
+    async fn part(&self, id: PieceId, key: &str, part: Part) -> Raw {
+        let read = self.objects.read(key, part).await;
+        read.map_err(|source| PieceError::Unread {
+            source: Arc::new(source),
+            which: self.which(id),
+        })
+    }
+
+    /// Decodes a chunk; what came over a network and does not decode is read once more.
+    async fn decoded(
+        &self,
+        id: PieceId,
+        key: &str,
+        part: Part,
+        mut bytes: Bytes,
+        values: Option<&Arc<Values>>,
+    ) -> Raw {
+        let array = &self.levels[id.level as usize].array;
+        let mut again = self.objects.is_remote();
+        loop {
+            let (array, values) = (array.clone(), values.cloned());
+            let done = compute(move || {
+                let decoded = decode(&array, bytes)?;
+                Ok(match values {
+                    Some(values) => values.convert(decoded),
+                    None => decoded,
+                })
+            });
+            let done = done
+                .await
+                .unwrap_or_else(|| Err("decoding it was interrupted".to_owned()));
+            match done {
+                Ok(decoded) => return Ok(Some(decoded)),
+                Err(_) if again => again = false,
+                Err(damage) => return Err(self.damaged(id, key, damage)),
+            }
+            match self.part(id, key, part.clone()).await? {
+                Some(read) => bytes = read,
+                None => return Ok(None),
+            }
+        }
+    }
+
+    /// Chunks as stored numbers, or as values; `None` for one that is not stored. All are of one level, and,
+    /// where there are shards, of one.
+    async fn raw(
+        &self,
+        level: u32,
+        ids: Vec<PieceId>,
+        values: Option<&Arc<Values>>,
+    ) -> Vec<(PieceId, Raw)> {
+        let array = &self.levels[level as usize];
+        let most = most_encoded(&array.array);
+        let Some(sharding) = &array.array.sharding else {
+            let one = async |id: PieceId| {
+                let index = unravel(id.number, &array.grid);
+                let key = super::below(&array.path, &array.array.keys.key(&index));
+                let whole = Part::Whole { most };
+                match self.part(id, &key, whole.clone()).await {
+                    Ok(Some(bytes)) => (id, self.decoded(id, &key, whole, bytes, values).await),
+                    other => (id, other),
+                }
+            };
+            return stream::iter(ids)
+                .map(one)
+                .buffer_unordered(RANGES_AT_ONCE)
+                .collect()
+                .await;
+        };
+        let Some(&first) = ids.first() else {
+            return Vec::new();
+        };
+        let index = unravel(first.number, &array.grid);
+        let shard: Vec<u64> = index
+            .iter()
+            .zip(&sharding.chunks)
+            .map(|(at, count)| at / count)
+            .collect();
+        let key = super::below(&array.path, &array.array.keys.key(&shard));
+        let index = match self.index(level, &shard, first, &key).await {
+            Ok(Some(index)) => index,
+            Ok(None) => return ids.into_iter().map(|id| (id, Ok(None))).collect(),
+            Err(error) => return ids.into_iter().map(|id| (id, Err(error.clone()))).collect(),
+        };
+        let (mut done, mut wanted, mut ranges) = (Vec::new(), Vec::new(), Vec::new());
+        for id in ids {
+            let at = unravel(id.number, &array.grid);
+            let inside: Vec<u64> = at
+                .iter()
+                .zip(&sharding.chunks)
+                .map(|(at, count)| at % count)
+                .collect();
+            match index.chunk(ravel(&inside, &sharding.chunks), most) {
+                Ok(Some(range)) => {
+                    wanted.push(id);
+                    ranges.push(range);
+                }
+                Ok(None) => done.push((id, Ok(None))),
+                Err(damage) => done.push((id, Err(self.damaged(id, &key, damage)))),
+            }
+        }
+        let merged = coalesced(&ranges, self.objects.read_cost());
+        let (key, wanted, ranges) = (&key, &wanted, &ranges);
+        let read = async |(span, numbers): (std::ops::Range<u64>, Vec<usize>)| {
+            let bytes = self
+                .part(wanted[numbers[0]], key, Part::Range(span.clone()))
+                .await;
+            let each = numbers.into_iter().map(|n| {
+                let (id, range, bytes) = (wanted[n], ranges[n].clone(), bytes.clone());
+                let begin = range.start - span.start;
+                async move {
+                    let bytes = match bytes {
+                        Ok(Some(bytes)) => bytes,
+                        // An index, but no shard: it was deleted in between.
+                        Ok(None) => return (id, Ok(None)),
+                        Err(error) => return (id, Err(error)),
+                    };
+                    let at = |at: u64| usize::try_from(at).expect("within what was read");
+                    let own = bytes.slice(at(begin)..at(begin + (range.end - range.start)));
+                    (
+                        id,
+                        self.decoded(id, key, Part::Range(range), own, values).await,
+                    )
+                }
+            });
+            futures::future::join_all(each).await
+        };
+        let read = stream::iter(merged)
+            .map(read)
+            .buffer_unordered(RANGES_AT_ONCE);
+        done.extend(read.collect::<Vec<_>>().await.into_iter().flatten());
+        done
+    }
+
+    /// The index of a shard; `None` if there is no such shard.
+    async fn index(
+        &self,
+        level: u32,
+        shard: &[u64],
+        of: PieceId,
+        key: &str,
+    ) -> Result<Option<Index>, PieceError> {
+        let array = self.levels[level as usize].array.clone();
+        let Some(sharding) = array.sharding.clone() else {
+            return Ok(None);
+        };
+        let shards = self.levels[level as usize]
+            .grid
+            .iter()
+            .zip(&sharding.chunks);
+        let shards: Vec<u64> = shards.map(|(chunks, per)| chunks.div_ceil(*per)).collect();
+        let id = (level, ravel(shard, &shards));
+        let start = |missing: Vec<ShardId>| {
+            let objects = self.objects.clone();
+            let (which, key) = (self.which(of), key.to_owned());
+            let work: Work<ShardId, Option<Index>, PieceError> = Box::pin(async move {
+                let length = sharding.index_bytes();
+                let part = match sharding.index_at_start {
+                    true => Part::Range(0..length),
+                    false => Part::Last(length),
+                };
+                let mut again = objects.is_remote();
+                let index = loop {
+                    let bytes = match objects.read(&key, part.clone()).await {
+                        Ok(Some(bytes)) => bytes,
+                        Ok(None) => break Ok(None),
+                        Err(source) => {
+                            let source = Arc::new(source);
+                            break Err(PieceError::Unread { source, which });
+                        }
+                    };
+                    match Index::read(bytes, &sharding) {
+                        Ok(index) => break Ok(Some(index)),
+                        Err(_) if again => again = false,
+                        Err(reason) => {
+                            let location = objects.location(&key);
+                            break Err(PieceError::Damaged {
+                                reason,
+                                which,
+                                location,
+                            });
+                        }
+                    }
+                };
+                vec![(id, index)]
+            });
+            match missing.is_empty() {
+                true => Vec::new(),
+                false => vec![(missing, work)],
+            }
+        };
+        let mut found = self.indices.get(&[id], start).await;
+        found.pop().flatten().unwrap_or(Ok(None))
+    }
+}
+
+/// Longest that an encoded chunk can sensibly be \[bytes\].
+fn most_encoded(array: &Array) -> u64 {
+    let decoded = array.chunk_bytes() as u64;
+    decoded + decoded / 8 + (64 << 10)
+}
+
+/// Numbers as they are stored, from the bytes of a chunk.
+fn decode(array: &Array, mut bytes: Bytes) -> Result<Bytes, Damage> {
+    let want = array.chunk_bytes();
+    for (n, codec) in array.encoding.codecs.iter().enumerate().rev() {
+        let most = match n {
+            0 => want,
+            _ => usize::try_from(most_encoded(array)).unwrap_or(usize::MAX),
+        };
+        bytes = codec.decode(bytes, most)?;
+    }
+    if bytes.len() == want {
+        Ok(bytes)
+    } else {
+        Err(format!(
+            "it has {} bytes of voxels instead of {want}",
+            bytes.len()
+        ))
+    }
+}
+
+impl Stored for ZarrImage {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.volume
+    }
+
+    fn touched(&self, channel: u32, level: u32, voxels: VoxelBox) -> Vec<(PieceId, Place)> {
+        let touched = self.levels[level as usize].touched(channel, voxels);
+        let touched = touched.into_iter();
+        touched
+            .map(|(number, place)| (PieceId { level, number }, place))
+            .collect()
+    }
+
+    fn read(self: &Arc<Self>, pieces: Vec<PieceId>) -> Vec<(Vec<PieceId>, Pieces)> {
+        // Chunks of a shard together, others alone.
+        let mut groups: BTreeMap<(u32, Vec<u64>), Vec<PieceId>> = BTreeMap::new();
+        for id in pieces {
+            let level = &self.levels[id.level as usize];
+            let mut group = unravel(id.number, &level.grid);
+            if let Some(sharding) = &level.array.sharding {
+                for (at, count) in group.iter_mut().zip(&sharding.chunks) {
+                    *at /= count;
+                }
+            }
+            groups.entry((id.level, group)).or_default().push(id);
+        }
+        let groups = groups.into_iter().map(|((level, _), ids)| {
+            let (this, wanted) = (self.clone(), ids.clone());
+            let work: Pieces = Box::pin(async move {
+                let missing = this
+                    .values
+                    .of_missing(&this.levels[level as usize].array.fill);
+                let read = this.raw(level, wanted, Some(&this.values)).await;
+                let piece = |raw: Option<Bytes>| raw.map_or(Piece::Uniform(missing), Piece::Values);
+                read.into_iter()
+                    .map(|(id, raw)| (id, raw.map(piece)))
+                    .collect()
+            });
+            (ids, work)
+        });
+        groups.collect()
+    }
+}

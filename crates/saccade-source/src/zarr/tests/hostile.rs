@@ -1,0 +1,307 @@
+//! Images behind servers that fail, lie, or are slow.
+
+use std::error::Error as _;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use bytes::Bytes;
+use glam::UVec3;
+use serde_json::{Value, json};
+
+use super::ZarrSource;
+use super::written::{read_all, version_3, write};
+use crate::objects::{HttpObjects, Patience};
+use crate::test_server::{Fault, TestServer};
+use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
+
+fn patience() -> Patience {
+    Patience {
+        attempts: 3,
+        first_wait: Duration::from_millis(5),
+        longest_wait: Duration::from_millis(50),
+        idle: Duration::from_millis(400),
+        slowest: 10_000,
+    }
+}
+
+fn sharded() -> Value {
+    let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
+    let zstd = json!({"name": "zstd", "configuration": {"level": 1, "checksum": false}});
+    json!([{"name": "sharding_indexed", "configuration": {"chunk_shape": [4, 16, 20],
+        "codecs": [bytes, zstd], "index_codecs": [bytes, {"name": "crc32c"}], "index_location": "end"}}])
+}
+
+fn blosc() -> Value {
+    let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
+    json!([bytes, {"name": "blosc", "configuration": {"cname": "zstd", "clevel": 5, "shuffle": "shuffle",
+        "typesize": 2, "blocksize": 0}}])
+}
+
+/// A server of an image with these codecs, and the image's values.
+async fn server(shard: [u32; 3], codecs: &Value) -> (Arc<TestServer>, Vec<u16>) {
+    let root = tempfile::tempdir().unwrap();
+    let folder = root.path().join("image.zarr");
+    let want = write(&folder, "uint16", &version_3("uint16", shard, codecs));
+    (TestServer::of_folder(&folder).await, want)
+}
+
+async fn open(server: &TestServer) -> ZarrSource {
+    let objects = HttpObjects::with_patience(&server.url, patience()).unwrap();
+    ZarrSource::open(Arc::new(objects), "image.zarr")
+        .await
+        .unwrap()
+}
+
+fn id(x: u32) -> ChunkId {
+    ChunkId {
+        channel: 0,
+        level: 0,
+        chunk: UVec3::new(x, 0, 0),
+    }
+}
+
+fn told(error: &ChunkError) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text += &format!(": {error}");
+        cause = error.source();
+    }
+    text
+}
+
+#[test]
+fn voxels_over_http_are_those_of_the_folder() {
+    for (shard, codecs) in [([8, 64, 40], sharded()), ([4, 33, 40], blosc())] {
+        let tokio = tokio::runtime::Runtime::new().unwrap();
+        let (server, want) = tokio.block_on(server(shard, &codecs));
+        let source = tokio.block_on(open(&server));
+        assert!(read_all(&tokio, &source) == want);
+    }
+}
+
+#[tokio::test]
+async fn neighbours_in_a_shard_come_together_and_once() {
+    let (server, _) = server([16, 64, 80], &sharded()).await;
+    let source = open(&server).await;
+    server.log.lock().unwrap().clear();
+    // 64 x 61 x 13 voxels are 4 x 4 x 4 chunks of one shard; several readers want them.
+    let readers = (0..6).map(|_| source.read(id(0)));
+    for read in futures::future::join_all(readers).await {
+        assert!(matches!(read, Ok(Chunk::Voxels(_))));
+    }
+    let log = server.log.lock().unwrap().clone();
+    let indices = log
+        .iter()
+        .filter(|(_, range)| range.as_deref() == Some("-1028"));
+    assert_eq!(indices.count(), 1, "{log:?}");
+    assert_eq!(
+        log.len(),
+        2,
+        "an index, and everything else at once: {log:?}"
+    );
+    // The rest is in the same shard, whose index is known.
+    source.read(id(1)).await.unwrap();
+    assert_eq!(
+        server.log.lock().unwrap().len(),
+        2,
+        "all of it came with its neighbours"
+    );
+}
+
+#[tokio::test]
+async fn what_passes_is_read_again_and_what_stays_names_the_chunk() {
+    let (server, _) = server([4, 33, 40], &blosc()).await;
+    let good = open(&server).await.read(id(0)).await.unwrap();
+    let faults = [
+        (Fault::Status("429 Too Many Requests"), true),
+        (Fault::Status("503 Slow Down\r\nretry-after: 0"), true),
+        (Fault::Reset, true),
+        (Fault::Cut, true),
+        (Fault::WrongLength, true),
+        (Fault::Stall, true),
+        (Fault::Garbage, false),
+        (Fault::Longer(-3), false),
+        (Fault::Longer(7), false),
+    ];
+    for (fault, transient) in faults {
+        let source = open(&server).await;
+        server.fail_next([fault]);
+        assert!(source.read(id(0)).await.unwrap() == good, "{fault:?}");
+
+        let source = open(&server).await;
+        server.fail_always("0/c/1/0/0", fault);
+        let error = source.read(id(0)).await.unwrap_err();
+        let named = told(&error);
+        assert!(
+            named.contains("chunk [1, 0, 0] of level 0"),
+            "{fault:?}: {named}"
+        );
+        assert!(named.contains("/sub/0/c/1/0/0"), "{fault:?}: {named}");
+        assert_eq!(error.is_transient(), transient, "{fault:?}: {named}");
+        // Voxels of other chunks are not affected: x from 64 on is in another one.
+        assert!(
+            matches!(source.read(id(1)).await, Ok(Chunk::Voxels(_))),
+            "{fault:?}"
+        );
+        // What failed is not remembered.
+        server.always.lock().unwrap().clear();
+        assert!(source.read(id(0)).await.unwrap() == good, "{fault:?}");
+    }
+}
+
+#[tokio::test]
+async fn missing_is_empty_and_forbidden_is_told() {
+    let (server, want) = server([4, 33, 40], &blosc()).await;
+    server.objects.lock().unwrap().remove("0/c/0/0/1");
+    let source = open(&server).await;
+    let Chunk::Voxels(bytes) = source.read(id(0)).await.unwrap() else {
+        panic!("the others are there");
+    };
+    let at = |x: usize| u16::from_le_bytes([bytes[x * 2], bytes[x * 2 + 1]]);
+    assert_eq!((at(39), at(40)), (want[39], 0));
+    server.fail_always("0/c/0/0/0", Fault::Status("403 Forbidden"));
+    let source = open(&server).await;
+    let error = source.read(id(0)).await.unwrap_err();
+    assert!(
+        told(&error).contains("access is denied") && !error.is_transient(),
+        "{}",
+        told(&error)
+    );
+}
+
+#[tokio::test]
+async fn bombs_are_refused() {
+    let codecs =
+        |packer: Value| json!([{"name": "bytes", "configuration": {"endian": "little"}}, packer]);
+    let zeros = vec![0; 12 << 20];
+    let zstd = zstd::bulk::compress(&zeros, 1).unwrap();
+    // Without its length in front: only decompressing tells.
+    let hidden = zstd::stream::encode_all(&zeros[..], 1).unwrap();
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut gzip, &zeros).unwrap();
+    let gzip = gzip.finish().unwrap();
+    let mut blosc_header = vec![2, 1, 1, 2];
+    for number in [1 << 30, 1 << 20, 20_u32] {
+        blosc_header.extend(number.to_le_bytes());
+    }
+    blosc_header.extend([0; 4]);
+    let zstd_codec = json!({"name": "zstd", "configuration": {"level": 1, "checksum": false}});
+    let gzip_codec = json!({"name": "gzip", "configuration": {"level": 1}});
+    for (packer, bomb) in [
+        (zstd_codec.clone(), zstd),
+        (zstd_codec, hidden),
+        (gzip_codec, gzip),
+        (blosc()[1].clone(), blosc_header),
+    ] {
+        let (server, _) = server([4, 33, 40], &codecs(packer.clone())).await;
+        let source = open(&server).await;
+        server
+            .objects
+            .lock()
+            .unwrap()
+            .insert("0/c/0/0/0".to_owned(), bomb.into());
+        let error = source.read(id(0)).await.unwrap_err();
+        let named = told(&error);
+        assert!(
+            named.contains("damaged") && named.contains("c/0/0/0"),
+            "{packer}: {named}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn indices_that_lie_are_told() {
+    let key = "0/c/0/0/0";
+    let (server, _) = server([16, 64, 80], &sharded()).await;
+    let whole = server.objects.lock().unwrap()[key].clone();
+    let index = whole.len() - 1028;
+    let lies = |offset: u64, length: u64, checked: bool| {
+        let mut shard = whole.to_vec();
+        for entry in shard[index..][..1024].chunks_exact_mut(16) {
+            entry[..8].copy_from_slice(&offset.to_le_bytes());
+            entry[8..].copy_from_slice(&length.to_le_bytes());
+        }
+        if checked {
+            let sum = crc32c::crc32c(&shard[index..][..1024]).to_le_bytes();
+            shard[index + 1024..].copy_from_slice(&sum);
+        }
+        Bytes::from(shard)
+    };
+    for (shard, says) in [
+        (lies(0, 10, false), "crc32c"),
+        (lies(u64::MAX - 5, 10, true), "no file reaches"),
+        (lies(1 << 40, 10, true), "ends before"),
+        (lies(0, 1 << 50, true), "can need"),
+        (lies(3, 100, true), "decompress"),
+        (lies(0, 0, true), "instead of"),
+        (whole.slice(..500), "index has 500"),
+    ] {
+        server.objects.lock().unwrap().insert(key.to_owned(), shard);
+        let error = open(&server).await.read(id(0)).await.unwrap_err();
+        let named = told(&error);
+        assert!(
+            named.contains(says) && named.contains(key) && named.contains("of level 0"),
+            "{says}: {named}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_request_ends_with_the_last_who_wants_it() {
+    let (server, _) = server([16, 64, 80], &sharded()).await;
+    let source = open(&server).await;
+    server.fail_always("0/c/0/0/0", Fault::Stall);
+    let mut first = Box::pin(source.read(id(0)));
+    let mut second = Box::pin(source.read(id(1)));
+    let both = async {
+        drop(futures::future::join(&mut first, &mut second).await);
+    };
+    assert!(
+        tokio::time::timeout(Duration::from_millis(60), both)
+            .await
+            .is_err()
+    );
+    drop(first);
+    tokio::time::sleep(Duration::from_millis(30)).await;
+    assert_eq!(
+        server.gone.load(Ordering::SeqCst),
+        0,
+        "somebody still waits"
+    );
+    drop(second);
+    for _ in 0..200 {
+        if server.gone.load(Ordering::SeqCst) > 0 {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    panic!("nobody waits, and the request goes on");
+}
+
+#[test]
+fn metadata_that_cannot_be_read_say_where() {
+    let tokio = tokio::runtime::Runtime::new().unwrap();
+    tokio.block_on(async {
+        let (server, _) = server([16, 64, 80], &sharded()).await;
+        for (fault, says) in [
+            (Fault::Status("500 Oops"), "500"),
+            (Fault::Status("403 Forbidden"), "denied"),
+            (Fault::Garbage, "make no sense"),
+        ] {
+            server.fail_always("zarr.json", fault);
+            let objects = HttpObjects::with_patience(&server.url, patience()).unwrap();
+            let error = ZarrSource::open(Arc::new(objects), "x").await.unwrap_err();
+            let mut text = error.to_string();
+            if let Some(cause) = error.source() {
+                text += &cause.to_string();
+            }
+            assert!(
+                text.contains(says) && text.contains("/sub/zarr.json"),
+                "{text}"
+            );
+            server.always.lock().unwrap().clear();
+        }
+    });
+}
