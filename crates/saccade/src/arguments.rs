@@ -1,12 +1,11 @@
 //! Values on the command line.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
 use glam::{DVec2, DVec3, UVec2, UVec3};
 use saccade_archive::{ArchiveLocation, CatalogLocation, LocationError, StorageLocation};
 use saccade_core::volume::check_name;
-use saccade_source::zarr::ZarrSource;
 
 /// The visualization archive that a command works on.
 #[derive(Args)]
@@ -32,14 +31,6 @@ pub(crate) struct CatalogArgument {
 impl Archive {
     pub(crate) fn location(&self) -> Result<ArchiveLocation, LocationError> {
         self.catalog.location(self.archive.clone())
-    }
-
-    /// The folder, if an OME-Zarr image is in it instead.
-    pub(crate) fn image(&self) -> Option<&Path> {
-        match &self.archive {
-            StorageLocation::Folder(folder) if ZarrSource::is_zarr(folder) => Some(folder),
-            _ => None,
-        }
     }
 }
 

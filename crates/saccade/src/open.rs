@@ -1,44 +1,80 @@
-//! Volumes that the command line names: of a server, of an archive, or an image in a folder.
+//! Volumes that the command line names: of a server, of an archive, or an image that somebody else wrote.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail, ensure};
-use saccade_archive::{LocationError, StorageLocation, VisualizationArchive};
+use saccade_archive::{StorageLocation, VisualizationArchive};
 use saccade_serve::{CatalogStatus, StatusSource};
-use saccade_source::VolumeSource;
-use saccade_source::remote::{Quarantined, RemoteSource, Status, volumes};
+use saccade_source::objects::Location;
+use saccade_source::remote::{Quarantined, RemoteError, RemoteSource, Status, volumes};
 use saccade_source::stitched::StitchedSource;
 use saccade_source::zarr::ZarrSource;
+use saccade_source::{SourceError, VolumeSource, images};
 use saccade_view::AcquisitionReader;
 
 use crate::arguments::CatalogArgument;
+use crate::report::say;
 use crate::stitching::Stitching;
 
 /// Where a volume is.
 #[derive(Clone, Debug)]
 pub(crate) enum Place {
-    /// The address of a server.
-    Server(String),
-    /// An OME-Zarr image in a folder.
-    Zarr(PathBuf),
+    /// An address: of a server, or of an image.
+    Address(String),
+    /// An image, which nothing else is.
+    Image(Location),
+    /// A bucket: an image, or, with a catalog, a visualization archive.
+    Bucket(StorageLocation, Location),
     /// A visualization archive.
     Archive(StorageLocation),
 }
 
 impl FromStr for Place {
-    type Err = LocationError;
-    fn from_str(text: &str) -> Result<Self, LocationError> {
-        let server = text.starts_with("http://") || text.starts_with("https://");
-        Ok(if server {
-            Self::Server(text.to_owned())
-        } else if ZarrSource::is_zarr(Path::new(text)) {
-            Self::Zarr(text.into())
-        } else {
-            Self::Archive(text.parse()?)
+    type Err = String;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let location = || text.parse().map_err(|error| format!("{error}"));
+        let kinds = ["precomputed://", "zarr://", "zarr2://", "zarr3://", "gs://"];
+        if text.starts_with("http://") || text.starts_with("https://") {
+            return Ok(Self::Address(text.to_owned()));
+        }
+        if kinds.iter().any(|kind| text.starts_with(kind)) || is_image(Path::new(text)) {
+            return Ok(Self::Image(location()?));
+        }
+        let storage = text
+            .parse::<StorageLocation>()
+            .map_err(|error| error.to_string())?;
+        Ok(match storage {
+            StorageLocation::Folder(_) => Self::Archive(storage),
+            bucket => Self::Bucket(bucket, location()?),
         })
     }
+}
+
+/// Whether an image that somebody else wrote is in a folder.
+fn is_image(folder: &Path) -> bool {
+    ZarrSource::is_zarr(folder) || folder.join("info").is_file()
+}
+
+/// Opens an image, and tells what its user should know.
+async fn open_image(location: &Location) -> Result<Arc<dyn VolumeSource>> {
+    let image = images::open(location).await?;
+    for note in &image.notes {
+        say(note);
+    }
+    Ok(image.source)
+}
+
+/// Whether somebody answered, though not as a Saccade server does.
+fn is_no_server(error: &SourceError) -> bool {
+    let SourceError::Open { source, .. } = error else {
+        return false;
+    };
+    matches!(
+        source.downcast_ref::<RemoteError>(),
+        Some(RemoteError::Status { .. } | RemoteError::Answer { .. })
+    )
 }
 
 /// An open volume, and who knows how its acquisition is coming along.
@@ -56,14 +92,21 @@ impl Place {
         stitching: &Stitching,
     ) -> Result<Opened> {
         match self {
-            Self::Server(address) => {
+            Self::Address(address) => {
                 ensure!(
                     !catalog.is_given(),
-                    "a server has its own catalog: leave out --catalog"
+                    "what is behind an address has no catalog here: leave out --catalog"
                 );
+                let offered = match volumes(address).await {
+                    Ok(offered) => offered,
+                    Err(error) if is_no_server(&error) => {
+                        return Self::image(&address.parse()?, name).await;
+                    }
+                    Err(error) => return Err(error.into()),
+                };
                 let name = match name {
                     Some(name) => name.to_owned(),
-                    None => match volumes(address).await?.into_iter().next() {
+                    None => match offered.into_iter().next() {
                         Some(name) => name,
                         None => bail!("the server offers no volumes yet: {address}"),
                     },
@@ -79,22 +122,18 @@ impl Place {
                     acquisition: Some(acquisition),
                 })
             }
-            Self::Zarr(folder) => {
+            Self::Image(location) => {
                 ensure!(
                     !catalog.is_given(),
-                    "an OME-Zarr image has no catalog: leave out --catalog"
+                    "an image has no catalog: leave out --catalog"
                 );
-                let source = ZarrSource::open(folder).await?;
-                if let Some(name) = name {
-                    let own = &source.volume().name;
-                    ensure!(name == own, "the image is called {own:?}, not {name:?}");
-                }
-                Ok(Opened {
-                    source: Arc::new(source),
-                    acquisition: None,
-                })
+                Self::image(location, name).await
             }
-            Self::Archive(storage) => {
+            Self::Bucket(_, location) if !catalog.is_given() => {
+                let opened = Self::image(location, name).await;
+                opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for")
+            }
+            Self::Bucket(storage, _) | Self::Archive(storage) => {
                 let location = catalog.location(storage.clone())?;
                 let archive = VisualizationArchive::open(&location).await?;
                 let name = match name {
@@ -120,6 +159,45 @@ impl Place {
                     acquisition: Some(acquisition),
                 })
             }
+        }
+    }
+
+    /// Opens an image, which has the name that is asked for.
+    async fn image(location: &Location, name: Option<&str>) -> Result<Opened> {
+        let source = open_image(location).await?;
+        if let Some(name) = name {
+            let own = &source.volume().name;
+            ensure!(name == own, "the image is called {own:?}, not {name:?}");
+        }
+        Ok(Opened {
+            source,
+            acquisition: None,
+        })
+    }
+
+    /// The source of an image, for those who offer it; `None` for an archive. A server's volumes are not offered
+    /// again.
+    pub(crate) async fn open_to_serve(
+        &self,
+        catalog: &CatalogArgument,
+    ) -> Result<Option<Arc<dyn VolumeSource>>> {
+        match self {
+            Self::Address(address) => Ok(Some(open_image(&address.parse()?).await?)),
+            Self::Image(location) => Ok(Some(open_image(location).await?)),
+            Self::Bucket(_, location) if !catalog.is_given() => {
+                let opened = open_image(location).await;
+                let opened = opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for");
+                Ok(Some(opened?))
+            }
+            Self::Bucket(..) | Self::Archive(_) => Ok(None),
+        }
+    }
+
+    /// What an archive is stored in.
+    pub(crate) fn storage(&self) -> Option<&StorageLocation> {
+        match self {
+            Self::Bucket(storage, _) | Self::Archive(storage) => Some(storage),
+            Self::Address(_) | Self::Image(_) => None,
         }
     }
 }

@@ -32,7 +32,7 @@ fn channels(text: &str) -> Result<Channels, ShownError> {
 #[derive(Args)]
 pub(crate) struct Render {
     /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
-    /// --catalog; or the folder of an OME-Zarr image
+    /// --catalog; or an OME-Zarr or precomputed image: its folder, http(s)://, s3:// or gs:// address
     #[arg(value_name = "URL|ARCHIVE|IMAGE")]
     place: Place,
 

@@ -1,26 +1,30 @@
 //! `saccade serve`: an archive over HTTP.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use clap::Args;
 use saccade_archive::VisualizationArchive;
 use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, offer_archive};
 
-use saccade_source::zarr::ZarrSource;
-
-use crate::arguments::Archive;
+use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
+use crate::open::Place;
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
 
-/// Offer the volumes of an archive, or an OME-Zarr image, over HTTP, with the browser application.
+/// Offer the volumes of an archive, or an image that somebody else wrote, over HTTP, with the browser
+/// application. Nothing is fetched for clients but from the places given here.
 #[derive(Args)]
 pub(crate) struct Serve {
+    /// A visualization archive: its folder, or s3://bucket/prefix with --catalog; or an OME-Zarr or precomputed
+    /// image: its folder, http(s)://, s3:// or gs:// address
+    #[arg(value_name = "ARCHIVE|IMAGE")]
+    place: Place,
+
     #[command(flatten)]
-    archive: Archive,
+    catalog: CatalogArgument,
 
     #[command(flatten)]
     at: At,
@@ -76,9 +80,9 @@ const POLL: Duration = Duration::from_secs(2);
 
 impl Serve {
     pub(crate) async fn run(self) -> Result<()> {
-        if let Some(folder) = self.archive.image() {
+        if let Some(image) = self.place.open_to_serve(&self.catalog).await? {
             let volumes = Volumes::new();
-            volumes.publish(Arc::new(ZarrSource::open(folder).await?), None);
+            volumes.publish(image, None);
             let server = Server::bind(self.at.address()).await?;
             tell(&server.url());
             server
@@ -86,7 +90,9 @@ impl Serve {
                 .await?;
             return Ok(());
         }
-        let archive = VisualizationArchive::open(&self.archive.location()?).await?;
+        let storage = self.place.storage().context("there is no archive")?;
+        let location = self.catalog.location(storage.clone())?;
+        let archive = VisualizationArchive::open(&location).await?;
         let server = Server::bind(self.at.address()).await?;
         let volumes = Volumes::new();
         let options = self.stitching.options().await;

@@ -13,7 +13,7 @@ use crate::stitching::Stitching;
 #[derive(Args)]
 pub(crate) struct View {
     /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
-    /// --catalog; or the folder of an OME-Zarr image
+    /// --catalog; or an OME-Zarr or precomputed image: its folder, http(s)://, s3:// or gs:// address
     #[arg(value_name = "URL|ARCHIVE|IMAGE")]
     place: Place,
 

@@ -4,6 +4,7 @@
 
 mod demo;
 mod errors;
+mod images;
 mod whole_way;
 
 use std::ffi::OsStr;

@@ -1,0 +1,183 @@
+//! Images behind addresses, and what a server fetches for its clients: nothing but these.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::{TcpListener, TcpStream};
+use std::sync::{Arc, Mutex};
+
+use serde_json::json;
+
+use crate::{Running, run, saccade, stderr};
+
+/// Files on loopback, and who asked for which.
+#[derive(Default)]
+struct Files {
+    /// Paths and answers: a status with its headers, and a body.
+    files: BTreeMap<String, (String, Vec<u8>)>,
+    asked: Mutex<Vec<String>>,
+}
+
+impl Files {
+    fn with(mut self, path: &str, body: impl Into<Vec<u8>>) -> Self {
+        self.files
+            .insert(path.to_owned(), ("200 OK".to_owned(), body.into()));
+        self
+    }
+
+    fn start(self) -> (Arc<Self>, String) {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let files = Arc::new(self);
+        let this = files.clone();
+        std::thread::spawn(move || {
+            for stream in listener.incoming() {
+                let this = this.clone();
+                std::thread::spawn(move || this.answer(&stream.unwrap()));
+            }
+        });
+        (files, address)
+    }
+
+    fn answer(&self, stream: &TcpStream) -> Option<()> {
+        let mut reader = BufReader::new(stream);
+        loop {
+            let mut first = String::new();
+            reader.read_line(&mut first).ok().filter(|n| *n > 0)?;
+            let path = first.split(' ').nth(1)?.to_owned();
+            self.asked.lock().unwrap().push(path.clone());
+            let mut line = String::new();
+            while line != "\r\n" {
+                line.clear();
+                reader.read_line(&mut line).ok().filter(|n| *n > 0)?;
+            }
+            let missing = ("404 Not Found".to_owned(), Vec::new());
+            let (status, body) = self.files.get(&path).unwrap_or(&missing);
+            let head = format!(
+                "HTTP/1.1 {status}\r\ncontent-length: {}\r\n\r\n",
+                body.len()
+            );
+            let mut writer = stream;
+            writer.write_all(&[head.as_bytes(), body].concat()).ok()?;
+        }
+    }
+}
+
+/// An OME-Zarr image of 100 x 70 x 9 voxels in chunks of 100 x 70 x 3, the last of which is elsewhere.
+fn image(elsewhere: &str) -> Files {
+    let axis = |name: &str| json!({"name": name, "type": "space", "unit": "nanometer"});
+    let scale = json!([{"type": "scale", "scale": [40, 4, 4]}]);
+    let multiscales = json!([{"axes": [axis("z"), axis("y"), axis("x")],
+        "datasets": [{"path": "0", "coordinateTransformations": scale}]}]);
+    let group = json!({"zarr_format": 3, "node_type": "group",
+        "attributes": {"ome": {"version": "0.5", "multiscales": multiscales}}});
+    let array = json!({"zarr_format": 3, "node_type": "array", "shape": [9, 70, 100], "data_type": "uint8",
+        "fill_value": 0, "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [3, 70, 100]}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "codecs": [{"name": "bytes"}]});
+    let chunk = |first: u32| -> Vec<u8> {
+        (0..21_000_u32)
+            .map(|n| u8::try_from(1 + (n * 7 + first) % 250).unwrap())
+            .collect()
+    };
+    let mut files = Files::default()
+        .with("/data/image.zarr/zarr.json", group.to_string())
+        .with("/data/image.zarr/0/zarr.json", array.to_string())
+        .with("/data/image.zarr/0/c/0/0/0", chunk(0))
+        .with("/data/image.zarr/0/c/1/0/0", chunk(100));
+    let moved = format!("302 Found\r\nlocation: http://{elsewhere}/inside");
+    files
+        .files
+        .insert("/data/image.zarr/0/c/2/0/0".to_owned(), (moved, Vec::new()));
+    files
+}
+
+#[test]
+fn a_server_fetches_from_its_image_and_from_nowhere_else() {
+    let (secret, elsewhere) = Files::default().with("/inside", vec![7; 21_000]).start();
+    let (files, address) = image(&elsewhere).start();
+    let image = format!("http://{address}/data/image.zarr");
+    let (_server, url) = Running::start(saccade().args(["serve", &image, "--port", "0"]));
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let get = |path: &str| {
+        let url = format!("{}{path}", url.trim_end_matches('/'));
+        runtime.block_on(async {
+            let answer = reqwest::get(url).await.unwrap();
+            (answer.status().as_u16(), answer.bytes().await.unwrap())
+        })
+    };
+    let (status, json) = get("/v/image/volume.json");
+    assert_eq!(status, 200, "{json:?}");
+    // Only chunks of z below 6 can be read; chunks of ours are 64 voxels deep, so that all end in an error that
+    // is not the secret.
+    let (status, body) = get("/v/image/zarr/0/c/0/0/0/0");
+    assert!(status >= 500 && !body.starts_with(&[7; 8]), "{status}");
+    assert!(
+        files
+            .asked
+            .lock()
+            .unwrap()
+            .iter()
+            .any(|path| path.ends_with("0/c/2/0/0"))
+    );
+    // Addresses of other places, in every way to write them.
+    let escaped = elsewhere.replace(':', "%3A");
+    for path in [
+        format!("/v/http%3A%2F%2F{escaped}%2Finside/volume.json"),
+        format!("/v/image/zarr/http%3A%2F%2F{escaped}%2Finside"),
+        format!("/v/image/zarr/0/c/0/0/0/0?url=http://{elsewhere}/inside"),
+        format!("//{elsewhere}/inside"),
+        "/v/image/zarr/..%2F..%2F..%2Finside".to_owned(),
+        "/v/image/zarr/0/c/0/0/0/..%2f..%2f..%2finside".to_owned(),
+        "/v/image/precomputed/..%2f..%2finside".to_owned(),
+    ] {
+        let (status, body) = get(&path);
+        assert!(
+            status >= 400 && !body.starts_with(&[7; 8]),
+            "{path}: {status}"
+        );
+    }
+    // A request whose target is another's address, as proxies are asked.
+    let mut stream =
+        TcpStream::connect(url.trim_start_matches("http://").trim_end_matches('/')).unwrap();
+    let request = format!(
+        "GET http://{elsewhere}/inside HTTP/1.1\r\nhost: {elsewhere}\r\nconnection: close\r\n\r\n"
+    );
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    assert!(
+        !answer.starts_with(b"HTTP/1.1 2"),
+        "{}",
+        String::from_utf8_lossy(&answer)
+    );
+    let asked = secret.asked.lock().unwrap().clone();
+    assert!(asked.is_empty(), "somebody else was asked: {asked:?}");
+    for path in files.asked.lock().unwrap().iter() {
+        assert!(
+            path.starts_with("/data/image.zarr/"),
+            "{path} is no part of the image"
+        );
+    }
+}
+
+#[test]
+fn what_is_no_image_says_what_was_looked_for() {
+    let (_files, address) = Files::default().with("/page/index.html", "hello").start();
+    let picture = std::env::temp_dir().join("saccade-never-written.png");
+    let picture = picture.to_str().unwrap();
+    let output = run(["render", &format!("http://{address}/page"), "-o", picture]);
+    let said = stderr(&output);
+    assert!(!output.status.success());
+    for part in ["zarr.json", "info", &address] {
+        assert!(said.contains(part), "{part:?} is not in: {said}");
+    }
+    let output = run(["render", "ftp://host/x.zarr", "-o", picture]);
+    assert!(
+        !output.status.success() && stderr(&output).contains("ftp"),
+        "{}",
+        stderr(&output)
+    );
+}
