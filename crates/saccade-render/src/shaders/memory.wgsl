@@ -107,23 +107,25 @@ fn find(channel: u32, level: u32, brick: vec3u) -> Found {
         physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
         value = directory[physical];
     }
-    loop {
-        let slot = value & ~STALE;
-        if span == 0u || slot < FIRST_SLOT {
-            break;
+    if (value & ~STALE) >= FIRST_SLOT && span > 0u {
+        loop {
+            let slot = value & ~STALE;
+            if span == edge {
+                last[channel] = LeafBlock(block_at, level + 1u, value);
+            }
+            let block = slot - FIRST_SLOT;
+            if !is_last {
+                mark_block_used(block);
+            }
+            span -= edge;
+            let at = (brick >> vec3u(span)) & inside;
+            let entry = (block << (3u * edge)) + ((((at.z << edge) + at.y) << edge) + at.x);
+            physical = frame.directory_entries + entry;
+            value = tables[entry];
+            continuing {
+                break if span == 0u || (value & ~STALE) < FIRST_SLOT;
+            }
         }
-        if span == edge {
-            last[channel] = LeafBlock(block_at, level + 1u, value);
-        }
-        let block = slot - FIRST_SLOT;
-        if !is_last {
-            mark_block_used(block);
-        }
-        span -= edge;
-        let at = (brick >> vec3u(span)) & inside;
-        let entry = (block << (3u * edge)) + ((((at.z << edge) + at.y) << edge) + at.x);
-        physical = frame.directory_entries + entry;
-        value = tables[entry];
     }
     return found_at(value, physical, span);
 }

@@ -40,6 +40,16 @@ fn all_channels() -> u32 {
     return (1u << channel_count()) - 1u;
 }
 
+// How many channels are among some, and the first of them. Loops over them take as many turns as a ray needs, and not as
+// many as there are channels.
+fn count_of(channels: u32) -> u32 {
+    return select(countOneBits(channels), 1u, SLOTS == 1u);
+}
+
+fn lowest_of(channels: u32) -> u32 {
+    return select(firstTrailingBit(channels), 0u, SLOTS == 1u);
+}
+
 // The cell of the volume nearest to a place on a ray.
 fn cell_at(depth: f32, ray: vec3f) -> vec3u {
     let at = frame.octree.eye + depth * ray * frame.octree.cells_per_nm;
@@ -128,11 +138,11 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
         if is_new {
             nodes_visited += 1u;
             alike = 0u;
-            for (var c = 0u; c < channel_count(); c += 1u) {
+            var rest = everything & ~hidden;
+            for (var n = count_of(rest); n > 0u; n -= 1u) {
+                let c = lowest_of(rest);
+                rest &= rest - 1u;
                 let bit = 1u << c;
-                if (hidden & bit) != 0u {
-                    continue;
-                }
                 if !channel_has(c, CHANNEL_VALUES) {
                     settled |= bit;
                     continue;

@@ -6,6 +6,7 @@
 //
 // Rays drawn at once wait for each other, and drivers that draw on the CPU run both sides of every
 // `if`. So what few need stands in an outer loop, and what all need in an inner one.
+// Loops end where their body ends, since rays that are done are drawn along up to there.
 
 @group(0) @binding(7) var bricks: texture_3d<f32>;
 @group(0) @binding(8) var bricks_sampler: sampler;
@@ -314,6 +315,15 @@ fn lit_surface(ray: vec3f) -> vec3f {
 
 // Loops, from the outside: look-ups that find no brick at once; stretches of one level and step; regions with
 // nothing to see; bricks; samples.
+// Channels whose samples do not go on from one place to the next have none before.
+fn nothing_before(channels: u32) {
+    if MODE == MODE_ISO_SURFACE {
+        for (var c = 0u; c < channel_count(); c += 1u) {
+            sample_before[c] = select(sample_before[c], 0.0, ((channels >> c) & 1u) != 0u);
+        }
+    }
+}
+
 fn trace(pixel: vec2u) -> vec3f {
     let from_middle = (vec2f(pixel) + 0.5) / vec2f(frame.size) * 2.0 - 1.0;
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
@@ -350,15 +360,16 @@ fn trace(pixel: vec2u) -> vec3f {
     while going {
         var depth = start;
         loop {
-            going = start < depths.y && transmitted > TERMINATION;
-            if !going {
-                break;
-            }
-            while start >= level_end {
-                if level_end >= 0.0 {
-                    level += 1u;
+            if start >= level_end {
+                loop {
+                    if level_end >= 0.0 {
+                        level += 1u;
+                    }
+                    level_end = depth_of_next(level, ray);
+                    continuing {
+                        break if start < level_end;
+                    }
                 }
-                level_end = depth_of_next(level, ray);
             }
             var finest_drawn = MAX_LEVELS;
             for (var c = 0u; c < channel_count(); c += 1u) {
@@ -388,9 +399,7 @@ fn trace(pixel: vec2u) -> vec3f {
                 start += f32(count) * step;
                 segments += count;
                 found = 0u;
-                for (var c = 0u; c < channel_count(); c += 1u) {
-                    sample_before[c] = 0.0;
-                }
+                nothing_before(everything);
                 if start >= stretch || segments >= doubling {
                     break;
                 }
@@ -400,6 +409,7 @@ fn trace(pixel: vec2u) -> vec3f {
             }
             let hidden = region.hidden;
             let around = region.leaving;
+            let visible = everything & ~hidden;
 
             if MODE == MODE_EMISSION_ABSORPTION && (hidden | region.uniform_) == everything {
                 let count = segments_until(min(stretch + sample_at * step, around), depth, step);
@@ -432,9 +442,10 @@ fn trace(pixel: vec2u) -> vec3f {
                 if SLOTS == 1u {
                     // Several bricks in a row: rays that are drawn at once wait for each other at its end, and no
                     // longer at the end of each brick. Surfaces end rays too soon for that.
+                    let most_bricks = select(3u, 1u, MODE == MODE_ISO_SURFACE);
                     let wanted = channel_level(0u, level);
                     let most = stretch + sample_at * step;
-                    for (var index = 0u; index < select(3u, 1u, MODE == MODE_ISO_SURFACE); index += 1u) {
+                    for (var index = 0u; index < most_bricks; index += 1u) {
                         let from_ = start + f32(count) * step;
                         let next = from_ + sample_at * min(step, depths.y - from_);
                         let holds = wanted == drawn_for[0] && next < drawn[0].leaving;
@@ -463,19 +474,20 @@ fn trace(pixel: vec2u) -> vec3f {
                         count += segments_until(min(min(most, around), drawn[0].leaving), next, step);
                         let end = start + f32(count) * step;
                         let last = end + sample_at * min(step, depths.y - end);
-                        if drawn[0].level != wanted || end >= stretch || last >= around || segments + count >= doubling {
+                        if index + 1u >= most_bricks || drawn[0].level != wanted || end >= stretch || last >= around || segments + count >= doubling {
                             break;
                         }
                     }
                 } else {
                     var until = stretch + sample_at * step;
-                    for (var c = 0u; c < channel_count(); c += 1u) {
+                    if hidden != 0u {
+                        until = min(until, around);
+                    }
+                    var rest = visible;
+                    for (var n = count_of(visible); n > 0u; n -= 1u) {
+                        let c = lowest_of(rest);
+                        rest &= rest - 1u;
                         let bit = 1u << c;
-                        if (hidden & bit) != 0u {
-                            until = min(until, around);
-                            sample_before[c] = 0.0;
-                            continue;
-                        }
                         let wanted = channel_level(c, level);
                         let holds = wanted == drawn_for[c] && depth < drawn[c].leaving;
                         if !holds && (found & bit) == 0u {
@@ -491,84 +503,88 @@ fn trace(pixel: vec2u) -> vec3f {
                     }
                     found = select(0u, found, lost != 0u);
                     count = segments_until(until, depth, step);
-                    sampled = everything & ~hidden & ~transparent;
+                    sampled = visible & ~transparent;
                 }
                 if lost != 0u {
                     break;
                 }
-                for (var c = 0u; c < channel_count(); c += 1u) {
-                    let bit = 1u << c;
-                    if (hidden & bit) == 0u && drawn[c].found.entry >= FIRST_SLOT {
+                nothing_before(everything & ~sampled);
+                var rest = visible;
+                for (var n = count_of(visible); n > 0u; n -= 1u) {
+                    let c = lowest_of(rest);
+                    rest &= rest - 1u;
+                    if drawn[c].found.entry >= FIRST_SLOT {
                         let distance = i32(drawn[c].level) - i32(drawn_for[c]);
                         if distance != 0 {
                             substituted_levels = max(substituted_levels, u32(abs(distance)));
                             substituted += count;
                         }
                     }
-                    if (sampled & bit) != 0u {
-                        if SLOTS > 1u {
-                            aim(c, depth, ray);
-                        }
-                    } else {
-                        sample_before[c] = 0.0;
+                    if SLOTS > 1u && (sampled & (1u << c)) != 0u {
+                        aim(c, depth, ray);
                     }
                 }
                 var left = select(0u, count, sampled != 0u);
                 samples += left * countOneBits(sampled);
                 var i = 0.0;
-                while left > 0u && transmitted > TERMINATION {
-                    let segment = min(step, depths.y - start - i * step);
-                    let ahead = i * step + sample_at * (segment - first);
-                    var sum = vec4f(0.0);
-                    var hit_at = 3e38;
-                    for (var c = 0u; c < channel_count(); c += 1u) {
-                        if SLOTS > 1u && (sampled & (1u << c)) == 0u {
-                            continue;
-                        }
-                        let stored = stored_at(in_brick(c, ahead));
-                        if MODE == MODE_MAXIMUM {
-                            largest_seen[c] = max(largest_seen[c], stored);
-                        } else if MODE == MODE_ISO_SURFACE {
-                            let iso = frame.channels[c].iso;
-                            if stored >= iso {
-                                let rise = stored - sample_before[c];
-                                let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);
-                                let at = ahead - back * step;
-                                if at < hit_at {
-                                    hit_at = at;
-                                    surface = c;
-                                    surface_level = drawn[c].level;
-                                    surface_at = in_brick(c, at);
+                if left > 0u {
+                    loop {
+                        let segment = min(step, depths.y - start - i * step);
+                        let ahead = i * step + sample_at * (segment - first);
+                        var sum = vec4f(0.0);
+                        var hit_at = 3e38;
+                        var rest = sampled;
+                        for (var n = count_of(sampled); n > 0u; n -= 1u) {
+                            let c = lowest_of(rest);
+                            rest &= rest - 1u;
+                            let stored = stored_at(in_brick(c, ahead));
+                            if MODE == MODE_MAXIMUM {
+                                largest_seen[c] = max(largest_seen[c], stored);
+                            } else if MODE == MODE_ISO_SURFACE {
+                                let iso = frame.channels[c].iso;
+                                if stored >= iso {
+                                    let rise = stored - sample_before[c];
+                                    let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);
+                                    let at = ahead - back * step;
+                                    if at < hit_at {
+                                        hit_at = at;
+                                        surface = c;
+                                        surface_level = drawn[c].level;
+                                        surface_at = in_brick(c, at);
+                                    }
                                 }
+                                sample_before[c] = stored;
+                            } else {
+                                var color = color_of(c, stored);
+                                let distance = i32(drawn[c].level) - i32(drawn_for[c]);
+                                if false_colors && distance != 0 {
+                                    color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
+                                }
+                                sum += vec4f(select(color.a * color.rgb, color.rgb, SLOTS == 1u), color.a);
                             }
-                            sample_before[c] = stored;
-                        } else {
-                            var color = color_of(c, stored);
-                            let distance = i32(drawn[c].level) - i32(drawn_for[c]);
-                            if false_colors && distance != 0 {
-                                color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
-                            }
-                            sum += vec4f(select(color.a * color.rgb, color.rgb, SLOTS == 1u), color.a);
                         }
-                    }
-                    if MODE == MODE_EMISSION_ABSORPTION {
-                        let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
-                        let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
-                        light += transmitted * opacity * share * sum.rgb;
-                        transmitted *= 1.0 - opacity;
-                    }
-                    if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
-                        surface_light = transmitted;
-                        transmitted = 0.0;
-                    }
-                    i += 1.0;
-                    left -= 1u;
-                    if SLOTS == 1u && i >= turns.x {
-                        first_texel[0] = next_texel[0];
-                        low_texel[0] = next_low[0];
-                        next_texel[0] = next_texel[1];
-                        next_low[0] = next_low[1];
-                        turns = vec2f(turns.y, 3e38);
+                        if MODE == MODE_EMISSION_ABSORPTION {
+                            let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
+                            let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
+                            light += transmitted * opacity * share * sum.rgb;
+                            transmitted *= 1.0 - opacity;
+                        }
+                        if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
+                            surface_light = transmitted;
+                            transmitted = 0.0;
+                        }
+                        i += 1.0;
+                        left -= 1u;
+                        if SLOTS == 1u && i >= turns.x {
+                            first_texel[0] = next_texel[0];
+                            low_texel[0] = next_low[0];
+                            next_texel[0] = next_texel[1];
+                            next_low[0] = next_low[1];
+                            turns = vec2f(turns.y, 3e38);
+                        }
+                        continuing {
+                            break if left == 0u || transmitted <= TERMINATION;
+                        }
                     }
                 }
                 samples -= left * countOneBits(sampled);
@@ -592,6 +608,13 @@ fn trace(pixel: vec2u) -> vec3f {
             if lost != 0u {
                 break;
             }
+            continuing {
+                going = start < depths.y && transmitted > TERMINATION;
+                break if !going;
+            }
+        }
+        if !going {
+            break;
         }
         for (var c = 0u; c < channel_count(); c += 1u) {
             let bit = 1u << c;
