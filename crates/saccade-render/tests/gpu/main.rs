@@ -9,6 +9,7 @@
 mod behaviour;
 mod channels;
 mod functions;
+mod fuzz;
 mod harness;
 mod modes;
 mod octree;
