@@ -205,6 +205,13 @@ impl Pull {
         }
     }
 
+    /// Another renderer begins: it has no bricks yet, and counts its frames anew. Chunks stay.
+    pub fn restart(&mut self) {
+        self.wanted_frame = None;
+        self.delivered.clear();
+        self.outdated.clear();
+    }
+
     /// The misses of a frame, most wanted first. They replace those of earlier frames; a report
     /// older than the newest is ignored.
     pub fn want(&mut self, frame: u64, misses: &[BrickId]) {

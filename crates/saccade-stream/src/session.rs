@@ -139,7 +139,7 @@ pub struct Status {
     pub frame_time: Option<Duration>,
     /// Size of that frame \[pixels\].
     pub frame_size: UVec2,
-    /// Whether the GPU is gone: a new session on a new device is needed.
+    /// Whether the GPU is gone: [`Session::set_gpu`] goes on with another.
     pub lost: bool,
     /// When to call again.
     pub again: Again,
@@ -192,6 +192,20 @@ fn poll_after(frame_time: Option<Duration>) -> Duration {
     quarter.clamp(Duration::from_millis(4), Duration::from_millis(50))
 }
 
+fn renderer(gpu: &Gpu, volume: &Arc<Volume>, bytes: u64) -> Result<Renderer, SessionError> {
+    // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn.
+    let software = gpu.adapter().device_type == DeviceType::Cpu;
+    let options = RendererOptions {
+        memory_bytes: bytes,
+        bands: if software { 4 } else { 1 },
+        ..RendererOptions::default()
+    };
+    Renderer::new(gpu, volume.clone(), options).map_err(|source| SessionError::Renderer {
+        source,
+        name: volume.name.clone(),
+    })
+}
+
 impl Session {
     /// Starts listening to the source; nothing is drawn yet.
     ///
@@ -204,19 +218,7 @@ impl Session {
         options: SessionOptions,
     ) -> Result<Self, SessionError> {
         let volume = source.volume().clone();
-        // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn.
-        let software = gpu.adapter().device_type == DeviceType::Cpu;
-        let renderer_options = RendererOptions {
-            memory_bytes: options.gpu_bytes,
-            bands: if software { 4 } else { 1 },
-            ..RendererOptions::default()
-        };
-        let renderer = Renderer::new(gpu, volume.clone(), renderer_options).map_err(|source| {
-            SessionError::Renderer {
-                source,
-                name: volume.name.clone(),
-            }
-        })?;
+        let renderer = renderer(gpu, &volume, options.gpu_bytes)?;
         let requests = Requests::new(source.clone(), options.wake);
         // Asked after listening began: no change is lost between the two.
         let revision = source.revision();
@@ -247,6 +249,31 @@ impl Session {
         };
         session.put_channels()?;
         Ok(session)
+    }
+
+    /// Goes on with another device, as when [`Status::lost`] says that this one is gone.
+    ///
+    /// Made again is what was on the device, and what mirrors it: page tables, octree, bricks. Kept are
+    /// the source and requests to it, chunks in main memory, channels and their histograms. So the picture comes
+    /// back as fast as bricks can be sent, and nothing is read twice that main memory still holds.
+    ///
+    /// # Errors
+    ///
+    /// [`SessionError`] when the volume does not suit this device; the session stays as it was.
+    pub fn set_gpu(&mut self, gpu: &Gpu) -> Result<(), SessionError> {
+        let ceiling = self.renderer.memory().ceiling;
+        self.renderer = renderer(gpu, self.renderer.volume(), ceiling)?;
+        self.pull.restart();
+        self.told.clear();
+        self.pending.clear();
+        self.drawn = 0;
+        self.drawn_view = None;
+        self.dirty = true;
+        self.report = None;
+        self.known_at = None;
+        self.views.clear();
+        self.put_channels()?;
+        Ok(())
     }
 
     /// The volume shown.
