@@ -20,6 +20,17 @@ pub(crate) fn of_children() -> Result<Duration> {
     in_time(parse(&stat, CHILDREN))
 }
 
+/// The same of the thread that asks, to the scheduler's ticks.
+pub(crate) fn of_thread() -> Result<Duration> {
+    let stat = fs::read_to_string("/proc/thread-self/schedstat")
+        .context("a thread's processor time needs /proc")?;
+    let spent = stat.split_whitespace().next();
+    let nanoseconds = spent.and_then(|n| n.parse().ok());
+    Ok(Duration::from_nanos(nanoseconds.context(
+        "/proc/thread-self/schedstat has an unknown form",
+    )?))
+}
+
 fn in_time(ticks: Option<u64>) -> Result<Duration> {
     let ticks = ticks.context("/proc/self/stat has an unknown form")?;
     Ok(Duration::from_millis(ticks * 1000 / TICKS_PER_SECOND))
@@ -42,6 +53,18 @@ fn parse(stat: &str, skip: usize) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_thread_that_sleeps_spends_nothing() {
+        let before = of_thread().unwrap();
+        std::thread::sleep(Duration::from_millis(60));
+        let asleep = of_thread().unwrap() - before;
+        assert!(asleep < Duration::from_millis(30), "{asleep:?}");
+        let mut sum = 0_u64;
+        while of_thread().unwrap() - before < asleep + Duration::from_millis(20) {
+            sum = std::hint::black_box(sum + 1);
+        }
+    }
 
     #[test]
     fn user_and_system_are_added_whatever_the_command_is_called() {

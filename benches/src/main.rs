@@ -46,7 +46,7 @@ struct Arguments {
     /// small where a processor does.
     #[arg(long, value_enum)]
     scale: Option<Scale>,
-    /// Rows to measure, by id; all when none is named.
+    /// Rows to measure, by id, or by the beginning of ids up to a dot; all when none is named.
     #[arg(value_name = "ID")]
     ids: Vec<String>,
 }
@@ -77,7 +77,8 @@ fn main() -> Result<()> {
 /// The groups with at least one of the rows asked for.
 fn wanted(ids: &[String]) -> Result<Vec<&'static rows::Group>> {
     let known: Vec<&str> = rows::GROUPS.iter().flat_map(|g| g.ids).copied().collect();
-    if let Some(unknown) = ids.iter().find(|id| !known.contains(&id.as_str())) {
+    let unknown = |wanted: &&String| !known.iter().any(|id| settings::names(wanted, id));
+    if let Some(unknown) = ids.iter().find(unknown) {
         bail!(
             "there is no row {unknown:?}; the rows are {}",
             known.join(", ")
@@ -86,6 +87,11 @@ fn wanted(ids: &[String]) -> Result<Vec<&'static rows::Group>> {
     let all = ids.is_empty();
     let groups = rows::GROUPS.iter();
     Ok(groups
-        .filter(|g| all || g.ids.iter().any(|id| ids.iter().any(|w| w == id)))
+        .filter(|g| {
+            all || g
+                .ids
+                .iter()
+                .any(|id| ids.iter().any(|w| settings::names(w, id)))
+        })
         .collect())
 }

@@ -3,6 +3,7 @@
 mod codec;
 mod construct;
 mod first_light;
+mod frame_cost;
 mod index;
 mod ingest;
 mod petascale;
@@ -109,6 +110,22 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: petascale::FIGURE_7_IDS,
         measure: petascale::figure_7,
+    },
+    Group {
+        ids: frame_cost::CPU_IDS,
+        measure: frame_cost::cpu_time,
+    },
+    Group {
+        ids: frame_cost::OCTREE_IDS,
+        measure: frame_cost::octree,
+    },
+    Group {
+        ids: frame_cost::STREAMING_IDS,
+        measure: frame_cost::streaming,
+    },
+    Group {
+        ids: frame_cost::FLIGHT_IDS,
+        measure: frame_cost::flight,
     },
 ];
 

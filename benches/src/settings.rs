@@ -19,10 +19,15 @@ pub(crate) struct Settings {
     pub(crate) scale: Option<Scale>,
 }
 
+/// Whether what was asked for is this row, or the beginning of its id up to a dot.
+pub(crate) fn names(wanted: &str, id: &str) -> bool {
+    wanted == id || (wanted.ends_with('.') && id.starts_with(wanted))
+}
+
 impl Settings {
     /// Whether a row is to be measured.
     pub(crate) fn wants(&self, id: &str) -> bool {
-        self.ids.is_empty() || self.ids.iter().any(|wanted| wanted == id)
+        self.ids.is_empty() || self.ids.iter().any(|wanted| names(wanted, id))
     }
 
     /// As published, but for drivers that draw on the CPU.
@@ -38,5 +43,24 @@ impl Settings {
             Some(folder) => plot.write(folder, name),
             None => Ok(()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_named_whole_or_up_to_a_dot() {
+        let settings = |ids: &[&str]| Settings {
+            ids: ids.iter().map(|id| (*id).to_owned()).collect(),
+            ..Settings::default()
+        };
+        assert!(settings(&[]).wants("render.a.b"));
+        assert!(settings(&["x", "render.a.b"]).wants("render.a.b"));
+        assert!(settings(&["render."]).wants("render.a.b"));
+        assert!(settings(&["render.a."]).wants("render.a.b"));
+        assert!(!settings(&["render.a"]).wants("render.a.b"));
+        assert!(!settings(&["rend"]).wants("render.a.b"));
     }
 }

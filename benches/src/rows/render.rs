@@ -65,7 +65,8 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
     Ok(vec![row])
 }
 
-fn source() -> Result<ArraySource> {
+/// A piece of tissue.
+pub(super) fn source() -> Result<ArraySource> {
     let volume = Volume::new(NAME, EXTENT, VOXEL_NM)?;
     let phantom = Phantom::new(1, VOXEL_NM)?;
     let mut sampler = phantom.sampler();
