@@ -1,7 +1,8 @@
 //! Volumes like those of the papers, given by formulas, so that a brick of any size of volume is made when it is needed.
 
+use std::collections::HashMap;
 use std::f64::consts::TAU;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::Result;
 use glam::{DVec3, IVec3, UVec3};
@@ -21,6 +22,10 @@ type Value = Box<dyn Fn(u32, DVec3) -> f64 + Send + Sync>;
 pub(crate) struct Formula {
     pub(crate) volume: Arc<Volume>,
     value: Value,
+    /// Whether all channels are the first.
+    alike: bool,
+    /// Bricks made so far: each of several ways to draw asks for them.
+    made: Mutex<HashMap<BrickId, Arc<[u8]>>>,
 }
 
 impl Formula {
@@ -40,12 +45,20 @@ impl Formula {
         Ok(Self {
             volume: Arc::new(volume),
             value: Box::new(value),
+            alike: false,
+            made: Mutex::default(),
         })
     }
-}
 
-impl Bricks for Formula {
-    fn brick(&self, id: BrickId) -> Option<Vec<u8>> {
+    /// Simulates channels: all are the first.
+    fn alike(self) -> Self {
+        Self {
+            alike: true,
+            ..self
+        }
+    }
+
+    fn make(&self, id: BrickId) -> Vec<u8> {
         let level = &self.volume.levels[id.level() as usize];
         let low = (id.brick() * BRICK_EDGE).as_ivec3() - BRICK_BORDER.cast_signed();
         let end = self.volume.extent().as_dvec3();
@@ -60,12 +73,28 @@ impl Bricks for Formula {
             reason = "from 0 to 1 times the largest"
         )]
         #[expect(clippy::cast_sign_loss, reason = "from 0 to 1 times the largest")]
-        Some(match self.volume.dtype {
+        match self.volume.dtype {
             Dtype::Uint16 => values
                 .flat_map(|v| ((v * 65_535.0) as u16).to_le_bytes())
                 .collect(),
             _ => values.map(|v| (v * 255.0) as u8).collect(),
-        })
+        }
+    }
+}
+
+impl Bricks for Formula {
+    fn brick(&self, id: BrickId) -> Option<Vec<u8>> {
+        let id = match BrickId::new(0, id.level(), id.brick()) {
+            Ok(first) if self.alike => first,
+            _ => id,
+        };
+        let made = || self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(brick) = made().get(&id) {
+            return Some(brick.to_vec());
+        }
+        let brick = self.make(id);
+        made().insert(id, brick.as_slice().into());
+        Some(brick)
     }
 }
 
@@ -165,14 +194,14 @@ impl DataSet {
             Self::Aneurism => {
                 let value = move |_, at: DVec3| vessels(at / size);
                 (
-                    Formula::new(extent, scanned, Dtype::Uint8, channels, value)?,
+                    Formula::new(extent, scanned, Dtype::Uint8, channels, value)?.alike(),
                     0..=u32::MAX,
                 )
             }
             Self::Bonsai => {
                 let value = move |_, at: DVec3| plant(at / size, at);
                 (
-                    Formula::new(extent, scanned, Dtype::Uint8, channels, value)?,
+                    Formula::new(extent, scanned, Dtype::Uint8, channels, value)?.alike(),
                     0..=u32::MAX,
                 )
             }
@@ -180,7 +209,7 @@ impl DataSet {
                 let value = snake(extent);
                 let value = move |_, at: DVec3| value(at);
                 (
-                    Formula::new(extent, scanned, Dtype::Uint8, channels, value)?,
+                    Formula::new(extent, scanned, Dtype::Uint8, channels, value)?.alike(),
                     0..=u32::MAX,
                 )
             }
