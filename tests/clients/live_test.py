@@ -2,19 +2,22 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import unittest
 from pathlib import Path
 
 import numpy as np
 import ome_zarr_models
+import tensorstore
 import yaozarrs
 import zarr
 
 from lib.clients import all_tensorstores, everyone
 from lib.reference import Reference
-from lib.saccade import Acquisition
+from lib.saccade import BIN, Acquisition
 
 POSITIONS = 60
 random = np.random.default_rng(5)
@@ -115,6 +118,42 @@ class Live(unittest.TestCase):
             np.testing.assert_array_equal(client(0, around), new, name)
         for name, client in trusting.items():
             self.assertTrue((client(0, around) == old).all(), f"{name} never cached: the comparison shows nothing")
+
+    def test_3_an_exported_part_is_the_part(self):
+        folder = Path(tempfile.mkdtemp(prefix="saccade-export-"))
+        self.addCleanup(shutil.rmtree, folder)
+        out = folder / "part.zarr"
+        low, high = np.array([37, 21, 5]), np.array([250, 190, 61])
+        region = ",".join(map(str, [*low, *high]))
+        run = [BIN, "export", self.acquisition.url, out, "--region", region]
+        ran = subprocess.run(run, capture_output=True, text=True, timeout=120)
+        self.assertEqual(ran.returncode, 0, ran.stderr)
+        self.assertRegex(ran.stderr, r"exported \d+\.\d MB in \d+ s: \d+ shards")
+        yaozarrs.validate_zarr_store(str(out))
+        group = zarr.open_group(out, mode="r", zarr_format=3)
+        image = ome_zarr_models.open_ome_zarr(group, version="0.5")
+        datasets = group.attrs["ome"]["multiscales"][0]["datasets"]
+        self.assertEqual(type(image).__name__, "Image")
+        voxel = np.array(self.reference.volume["voxel_nm"])
+        for level, dataset in enumerate(datasets):
+            down = np.array(self.reference.volume["levels"][level]["downsampling"])
+            first = np.floor(low / down).astype(int)
+            end = np.minimum(np.ceil(high / down).astype(int), self.reference.extents[level])
+            spec = {"driver": "zarr3", "kvstore": f"file://{out}/{level}/"}
+            for name, array in [("zarr", group[str(level)]), ("tensorstore", tensorstore.open(spec).result())]:
+                self.assertEqual(list(array.shape), [1, *(end - first)[::-1]], name)
+                values = np.asarray(array[0])
+                at = random.integers(0, end - first, (400, 3))
+                want = self.reference.values(level, at + first)
+                np.testing.assert_array_equal(values[tuple(at[:, ::-1].T)], want, f"{name}, level {level}")
+                self.assertGreater((want != 0).mean(), 0.3)
+            transforms = dataset["coordinateTransformations"]
+            scale, moved = transforms[0]["scale"][:0:-1], transforms[1]["translation"][:0:-1]
+            np.testing.assert_allclose(scale, voxel * down)
+            np.testing.assert_allclose(moved, (first + 0.5) * down * voxel - voxel / 2)
+        again = subprocess.run(run, capture_output=True, text=True, timeout=60)
+        self.assertNotEqual(again.returncode, 0)
+        self.assertIn("there is something already", again.stderr)
 
     @unittest.skipUnless(os.environ.get("SACCADE_CHROMIUM"), "no browser is named")
     def test_4_neuroglancer_shows_the_voxels(self):

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::catalog::{Catalog, CatalogError, CatalogLocation};
-use crate::storage::{LocalStorage, ObjectStorage, Storage, StorageError};
+use crate::storage::{Storage, StorageError};
 
 pub use location::{ArchiveLocation, LocationError, StorageLocation};
 
@@ -93,17 +93,16 @@ impl VisualizationArchive {
             }
         };
         match location.storage() {
-            StorageLocation::Folder(folder) => {
+            // After the catalog: where there is none, no folder is made.
+            StorageLocation::Folder(_) => {
                 let catalog = catalog().await?;
-                let storage = Arc::new(LocalStorage::new(folder)?);
+                let storage = location.storage().open().await?;
                 Ok(Self { catalog, storage })
             }
-            StorageLocation::Bucket(bucket) => {
+            StorageLocation::Bucket(_) => {
                 // Before a catalog is made: a wrong address should not leave one behind.
-                let storage = ObjectStorage::s3(bucket)?;
-                storage.check().await?;
+                let storage = location.storage().open().await?;
                 let catalog = catalog().await?;
-                let storage = Arc::new(storage);
                 Ok(Self { catalog, storage })
             }
         }

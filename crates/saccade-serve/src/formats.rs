@@ -3,7 +3,6 @@
 //! A format is a hierarchy of objects with text keys. [`Format::entry`] says what an object is; the
 //! voxels of those that hold some come from [`crate::pieces`].
 
-mod ome;
 mod precomputed;
 mod zarr2;
 mod zarr3;

@@ -5,6 +5,8 @@
 //! ([`remote`]). What a source cannot do is wait for the eye: everything above asks for chunks it
 //! needs now, in the order of need, and drops the requests it no longer needs.
 //!
+//! The other way round, [`export`] writes what a source delivers as an OME-Zarr image, and [`ome`] describes it.
+//!
 //! # Spaces and shapes
 //!
 //! Chunks are boxes of [`Volume::chunk`](saccade_core::volume::Volume::chunk) voxels of one level
@@ -23,11 +25,14 @@
 mod changes;
 mod codecs;
 pub mod conformance;
+#[cfg(not(target_family = "wasm"))]
+pub mod export;
 mod flights;
 pub mod images;
 pub mod maybe_send;
 pub mod memory;
 pub mod objects;
+pub mod ome;
 pub mod precomputed;
 pub mod remote;
 mod source;
@@ -39,8 +44,7 @@ mod test_server;
 mod values;
 pub mod zarr;
 
-pub use stored::PieceError;
-
 pub use source::{
     Change, ChangeReason, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource,
 };
+pub use stored::PieceError;

@@ -36,6 +36,7 @@ enum Command {
     Serve(commands::serve::Serve),
     View(commands::view::View),
     Render(commands::render::Render),
+    Export(commands::export::Export),
     Check(commands::check::Check),
 }
 
@@ -60,6 +61,7 @@ fn main() -> ExitCode {
             Command::Serve(serve) => done(serve.run().await),
             Command::View(view) => done(view.run().await),
             Command::Render(render) => done(render.run().await),
+            Command::Export(export) => done(export.run().await),
             Command::Check(check) => check.run().await,
         }
     });

@@ -1,10 +1,13 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::Arc;
 
 use super::VisualizationArchive;
 use crate::catalog::CatalogLocation;
-use crate::storage::{BucketLocation, BucketLocationError};
+use crate::storage::{
+    BucketLocation, BucketLocationError, LocalStorage, ObjectStorage, Storage, StorageError,
+};
 
 /// Where pyramids lie: a folder, or `s3://bucket/prefix`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -13,6 +16,24 @@ pub enum StorageLocation {
     Folder(PathBuf),
     /// A bucket of an object store.
     Bucket(BucketLocation),
+}
+
+impl StorageLocation {
+    /// Opens it; a folder is made if it is not there.
+    ///
+    /// # Errors
+    ///
+    /// As they occur: a folder that cannot be made, a bucket that does not exist or does not answer.
+    pub async fn open(&self) -> Result<Arc<dyn Storage>, StorageError> {
+        Ok(match self {
+            Self::Folder(folder) => Arc::new(LocalStorage::new(folder)?),
+            Self::Bucket(bucket) => {
+                let storage = ObjectStorage::s3(bucket)?;
+                storage.check().await?;
+                Arc::new(storage)
+            }
+        })
+    }
 }
 
 /// Where an archive is: its pyramids, and the catalog that names them.

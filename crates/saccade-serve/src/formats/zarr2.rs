@@ -1,9 +1,10 @@
 //! OME-Zarr 0.4: one Zarr 2 group, one array per level.
 
 use saccade_core::volume::{Dtype, Volume};
+use saccade_source::ome;
 use serde_json::{Value, json};
 
-use super::{Entry, Unknown, level_index, number, ome, only, padded, per_level};
+use super::{Entry, Unknown, level_index, number, only, padded, per_level};
 
 /// The version of the metadata, which it repeats in every part.
 const VERSION: &str = "0.4";
@@ -44,9 +45,9 @@ pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
 }
 
 fn group(volume: &Volume) -> Value {
-    let mut multiscale = ome::multiscale(volume);
+    let mut multiscale = ome::multiscale(&volume.name, &ome::placed(volume));
     multiscale["version"] = VERSION.into();
-    let mut omero = ome::omero(volume);
+    let mut omero = ome::omero(&volume.channels, volume.dtype, volume.extent().z / 2);
     omero["version"] = VERSION.into();
     json!({ "multiscales": [multiscale], "omero": omero })
 }

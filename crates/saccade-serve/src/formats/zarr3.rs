@@ -1,9 +1,10 @@
 //! OME-Zarr 0.5: one Zarr 3 group, one array per level.
 
 use saccade_core::volume::{Dtype, Volume};
+use saccade_source::ome;
 use serde_json::{Value, json};
 
-use super::{Entry, Unknown, level_index, number, ome, only, padded, per_level};
+use super::{Entry, Unknown, level_index, number, only, padded, per_level};
 
 /// What a key below the image's root names.
 pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
@@ -33,8 +34,8 @@ fn group(volume: &Volume) -> Value {
         "node_type": "group",
         "attributes": { "ome": {
             "version": "0.5",
-            "multiscales": [ome::multiscale(volume)],
-            "omero": ome::omero(volume),
+            "multiscales": [ome::multiscale(&volume.name, &ome::placed(volume))],
+            "omero": ome::omero(&volume.channels, volume.dtype, volume.extent().z / 2),
         }},
     })
 }

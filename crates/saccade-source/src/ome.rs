@@ -1,44 +1,65 @@
-//! What the metadata of OME-Zarr 0.4 and 0.5 have in common.
+//! What the metadata of an OME-Zarr image say, the same in versions 0.4 and 0.5: axes, levels and where they
+//! lie, how channels are to be shown.
 
 use glam::DVec3;
 use saccade_core::volume::{Dtype, Volume};
 use serde_json::{Value, json};
 
 /// The axes of every array, slowest first.
-pub(super) const AXES: [&str; 4] = ["c", "z", "y", "x"];
+pub const AXES: [&str; 4] = ["c", "z", "y", "x"];
 
 /// Colours of channels where there are several; one alone is white.
 const COLORS: [&str; 6] = ["00FF00", "FF00FF", "00FFFF", "FFFF00", "FF0000", "0000FF"];
 
-/// The image: axes, levels and where they lie.
-pub(super) fn multiscale(volume: &Volume) -> Value {
+/// Where the voxels of a level lie.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placed {
+    /// Size of a voxel \[nm\].
+    pub voxel_nm: DVec3,
+    /// Middle of the first voxel, from that of the volume's first voxel of level 0 \[nm\].
+    pub first_nm: DVec3,
+}
+
+/// Where the levels of a volume lie: a voxel that averages several has its middle in theirs.
+pub fn placed(volume: &Volume) -> Vec<Placed> {
+    let levels = volume.levels.iter();
+    let placed = levels.map(|level| {
+        let voxel_nm = volume.voxel_nm * level.downsampling;
+        Placed {
+            voxel_nm,
+            first_nm: (voxel_nm - volume.voxel_nm) / 2.0,
+        }
+    });
+    placed.collect()
+}
+
+/// The image: axes, and levels whose paths are their numbers.
+pub fn multiscale(name: &str, levels: &[Placed]) -> Value {
     let space = |name| json!({ "name": name, "type": "space", "unit": "nanometer" });
     let [c, z, y, x] = AXES;
-    let dataset = |(level, geometry): (usize, &saccade_core::levels::Level)| {
-        let scale = volume.voxel_nm * geometry.downsampling;
-        // A voxel that averages several has its middle in theirs.
-        let moved = (scale - volume.voxel_nm) / 2.0;
-        let mut transforms = vec![json!({ "type": "scale", "scale": czyx(1.0, scale) })];
-        if moved != DVec3::ZERO {
-            transforms.push(json!({ "type": "translation", "translation": czyx(0.0, moved) }));
+    let dataset = |(level, placed): (usize, &Placed)| {
+        let mut transforms = vec![json!({ "type": "scale", "scale": czyx(1.0, placed.voxel_nm) })];
+        if placed.first_nm != DVec3::ZERO {
+            let moved = czyx(0.0, placed.first_nm);
+            transforms.push(json!({ "type": "translation", "translation": moved }));
         }
         json!({ "path": level.to_string(), "coordinateTransformations": transforms })
     };
     json!({
-        "name": volume.name,
+        "name": name,
         "type": "mean",
         "axes": [{ "name": c, "type": "channel" }, space(z), space(y), space(x)],
-        "datasets": volume.levels.iter().enumerate().map(dataset).collect::<Vec<_>>(),
+        "datasets": levels.iter().enumerate().map(dataset).collect::<Vec<_>>(),
     })
 }
 
-/// How channels are to be shown.
-pub(super) fn omero(volume: &Volume) -> Value {
-    let largest = match volume.dtype {
+/// How channels of these names are to be shown; `section` is the one to begin with.
+pub fn omero(channels: &[String], dtype: Dtype, section: u32) -> Value {
+    let largest = match dtype {
         Dtype::Uint16 => u16::MAX,
         _ => u16::from(u8::MAX),
     };
-    let several = volume.channels.len() > 1;
+    let several = channels.len() > 1;
     let channel = |(index, label): (usize, &String)| {
         let color = if several {
             COLORS[index % COLORS.len()]
@@ -57,8 +78,8 @@ pub(super) fn omero(volume: &Volume) -> Value {
     };
     let model = if several { "color" } else { "greyscale" };
     json!({
-        "channels": volume.channels.iter().enumerate().map(channel).collect::<Vec<_>>(),
-        "rdefs": { "defaultT": 0, "defaultZ": volume.extent().z / 2, "model": model },
+        "channels": channels.iter().enumerate().map(channel).collect::<Vec<_>>(),
+        "rdefs": { "defaultT": 0, "defaultZ": section, "model": model },
     })
 }
 
@@ -69,13 +90,17 @@ fn czyx(c: f64, xyz: DVec3) -> [f64; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::formats::tests::volume;
+    use glam::UVec3;
+
+    fn volume() -> Volume {
+        Volume::new("em", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap()
+    }
 
     /// Every level spans the same nanometres: first edge at minus half a voxel of level 0.
     #[test]
     fn levels_lie_on_each_other() {
         let volume = volume();
-        let image = multiscale(&volume);
+        let image = multiscale(&volume.name, &placed(&volume));
         let datasets = image["datasets"].as_array().unwrap();
         assert_eq!(datasets.len(), volume.levels.len());
         for dataset in datasets {
@@ -96,9 +121,7 @@ mod tests {
 
     #[test]
     fn several_channels_are_told_apart() {
-        let mut volume = volume();
-        volume.channels = vec!["DAPI".into(), "GFP".into()];
-        let omero = omero(&volume);
+        let omero = omero(&["DAPI".into(), "GFP".into()], Dtype::Uint8, 0);
         let [a, b] = &omero["channels"].as_array().unwrap()[..] else {
             panic!("{omero}")
         };

@@ -1,0 +1,239 @@
+//! Which arrays and shards an export has, and what describes them.
+
+use std::sync::Arc;
+
+use glam::UVec3;
+use saccade_core::volume::{Dtype, Volume};
+use saccade_core::voxel_box::VoxelBox;
+use serde_json::{Value, json};
+
+use super::{ExportError, ExportOptions};
+use crate::ome::{self, Placed};
+
+/// Most chunks along an axis of a shard.
+const MOST_CHUNKS: u32 = 8;
+/// Most voxels' worth of a shard \[bytes\].
+const MOST_BYTES: u64 = 64 << 20;
+
+/// One shard.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct ShardId {
+    /// Level of the image.
+    pub(super) level: usize,
+    /// Channel of the image.
+    pub(super) channel: u32,
+    /// Position \[shards\], slowest axis first.
+    pub(super) zyx: [u32; 3],
+}
+
+impl ShardId {
+    /// Name of its object.
+    pub(super) fn key(self) -> String {
+        let [z, y, x] = self.zyx;
+        format!("{}/c/{}/{z}/{y}/{x}", self.level, self.channel)
+    }
+
+    pub(super) fn xyz(self) -> UVec3 {
+        let [z, y, x] = self.zyx;
+        UVec3::new(x, y, z)
+    }
+}
+
+/// One level of the image.
+#[derive(Clone, Debug)]
+pub(super) struct PlannedLevel {
+    /// The volume's.
+    pub(super) level: u32,
+    /// What of it is exported \[voxels of the level\].
+    pub(super) voxels: VoxelBox,
+    /// Size of a shard \[voxels\], whole chunks.
+    pub(super) shard: UVec3,
+}
+
+impl PlannedLevel {
+    /// Shards along each axis.
+    fn shards(&self) -> UVec3 {
+        let size = self.voxels.size();
+        UVec3::from_array(std::array::from_fn(|axis| {
+            size[axis].div_ceil(self.shard[axis])
+        }))
+    }
+
+    /// What a shard holds of the volume \[voxels of the level\].
+    pub(super) fn voxels_of(&self, shard: UVec3) -> VoxelBox {
+        let min = self.voxels.min + shard * self.shard;
+        VoxelBox::new(min, min.saturating_add(self.shard)).intersection(self.voxels)
+    }
+}
+
+/// All that an export is.
+#[derive(Clone, Debug)]
+pub(super) struct Plan {
+    pub(super) volume: Arc<Volume>,
+    pub(super) channels: Vec<u32>,
+    pub(super) levels: Vec<PlannedLevel>,
+    compression: u8,
+}
+
+impl Plan {
+    pub(super) fn new(volume: &Arc<Volume>, options: &ExportOptions) -> Result<Self, ExportError> {
+        let extent = volume.extent();
+        let whole = VoxelBox::of_size(extent);
+        let region = options.region.unwrap_or(whole);
+        let part = region.intersection(whole);
+        if part.is_empty() {
+            return Err(ExportError::Region { region, extent });
+        }
+        let count = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
+        let channels = { options.channels.clone() }.unwrap_or_else(|| (0..count).collect());
+        for (n, &channel) in channels.iter().enumerate() {
+            if channel >= count || channels[..n].contains(&channel) {
+                let known = volume.channels.clone();
+                return Err(ExportError::Channel { channel, known });
+            }
+        }
+        let last = u32::try_from(volume.levels.len() - 1).unwrap_or(u32::MAX);
+        if options.finest > last {
+            let level = options.finest;
+            return Err(ExportError::Level { level, last });
+        }
+        let mut levels = Vec::new();
+        for level in options.finest..=last {
+            let voxels = volume.levels[level as usize].box_from_voxels(part);
+            levels.push(PlannedLevel {
+                level,
+                voxels,
+                shard: shard_size(voxels.size(), volume.chunk, volume.dtype),
+            });
+            if voxels.size().cmple(volume.chunk).all() {
+                break;
+            }
+        }
+        Ok(Self {
+            volume: volume.clone(),
+            channels,
+            levels,
+            compression: options.compression.min(22),
+        })
+    }
+
+    /// Every shard, the coarsest levels first: what is wrong shows soon.
+    pub(super) fn shards(&self) -> impl Iterator<Item = ShardId> {
+        let levels = self.levels.iter().enumerate().rev();
+        levels.flat_map(move |(level, planned)| {
+            let channels = 0..u32::try_from(self.channels.len()).unwrap_or(u32::MAX);
+            channels.flat_map(move |channel| {
+                let shards = VoxelBox::of_size(planned.shards());
+                shards.iter().map(move |UVec3 { x, y, z }| ShardId {
+                    level,
+                    channel,
+                    zyx: [z, y, x],
+                })
+            })
+        })
+    }
+
+    /// Shards in which voxels of a box are, in any channel \[voxels of level 0\].
+    pub(super) fn touched(&self, voxels: VoxelBox) -> impl Iterator<Item = ShardId> {
+        let touched = move |planned: &PlannedLevel, shard: ShardId| {
+            let of_level = self.volume.levels[planned.level as usize].box_from_voxels(voxels);
+            planned.voxels_of(shard.xyz()).intersects(of_level)
+        };
+        self.shards()
+            .filter(move |shard| touched(&self.levels[shard.level], *shard))
+    }
+
+    /// What tells this export from others of the same place.
+    pub(super) fn description(&self) -> Value {
+        let extents = self
+            .volume
+            .levels
+            .iter()
+            .map(|level| level.extent.to_array());
+        json!({
+            "volume": self.volume.name,
+            "extents": extents.collect::<Vec<_>>(),
+            "channels": self.channels,
+            "finest": self.levels[0].level,
+            "min": self.levels[0].voxels.min.to_array(),
+            "max": self.levels[0].voxels.max.to_array(),
+            "arrays": (0..self.levels.len()).map(|level| self.array(level)).collect::<Vec<_>>(),
+        })
+    }
+
+    /// The image's description: `zarr.json` of the group.
+    pub(super) fn group(&self) -> Value {
+        let placed = ome::placed(&self.volume);
+        let levels = self.levels.iter().map(|planned| {
+            let Placed { voxel_nm, first_nm } = placed[planned.level as usize];
+            Placed {
+                voxel_nm,
+                first_nm: first_nm + planned.voxels.min.as_dvec3() * voxel_nm,
+            }
+        });
+        let levels: Vec<_> = levels.collect();
+        let names = self.channels.iter();
+        let names = names.map(|channel| self.volume.channels[*channel as usize].clone());
+        let section = self.levels[0].voxels.size().z / 2;
+        json!({
+            "zarr_format": 3,
+            "node_type": "group",
+            "attributes": { "ome": {
+                "version": "0.5",
+                "multiscales": [ome::multiscale(&self.volume.name, &levels)],
+                "omero": ome::omero(&names.collect::<Vec<_>>(), self.volume.dtype, section),
+            }},
+        })
+    }
+
+    /// A level's description: `zarr.json` of an array.
+    pub(super) fn array(&self, level: usize) -> Value {
+        let planned = &self.levels[level];
+        let czyx = |c: usize, UVec3 { x, y, z }| json!([c, z, y, x]);
+        let data_type = match self.volume.dtype {
+            Dtype::Uint16 => "uint16",
+            _ => "uint8",
+        };
+        let bytes = json!({ "name": "bytes", "configuration": { "endian": "little" } });
+        let mut codecs = vec![bytes.clone()];
+        if self.compression > 0 {
+            let zstd = json!({ "level": self.compression, "checksum": true });
+            codecs.push(json!({ "name": "zstd", "configuration": zstd }));
+        }
+        json!({
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": czyx(self.channels.len(), planned.voxels.size()),
+            "data_type": data_type,
+            "fill_value": 0,
+            "chunk_grid": {
+                "name": "regular",
+                "configuration": { "chunk_shape": czyx(1, planned.shard) },
+            },
+            "chunk_key_encoding": { "name": "default", "configuration": { "separator": "/" } },
+            "codecs": [{
+                "name": "sharding_indexed",
+                "configuration": {
+                    "chunk_shape": czyx(1, self.volume.chunk),
+                    "codecs": codecs,
+                    "index_codecs": [bytes, { "name": "crc32c" }],
+                    "index_location": "end",
+                },
+            }],
+            "dimension_names": ome::AXES,
+            "attributes": {},
+        })
+    }
+}
+
+/// As many chunks as fit into the limits, and no more than there are.
+fn shard_size(size: UVec3, chunk: UVec3, dtype: Dtype) -> UVec3 {
+    let chunks: [u32; 3] = std::array::from_fn(|axis| size[axis].div_ceil(chunk[axis]));
+    let mut along = UVec3::from_array(chunks).min(UVec3::splat(MOST_CHUNKS));
+    let bytes = |along: UVec3| VoxelBox::of_size(along * chunk).voxels() * dtype.bytes() as u64;
+    while bytes(along) > MOST_BYTES && along != UVec3::ONE {
+        let longest = (0..3).max_by_key(|axis| along[*axis]).unwrap_or(0);
+        along[longest] = along[longest].div_ceil(2);
+    }
+    along * chunk
+}

@@ -1,0 +1,393 @@
+use std::path::Path;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
+
+use glam::{DVec3, UVec3};
+use saccade_archive::storage::{FaultyStorage, LocalStorage, MemoryStorage, Storage, WriteFault};
+use saccade_core::volume::{Dtype, Volume};
+use saccade_core::voxel_box::VoxelBox;
+use zarrs::array::{Array, ArrayBytes, ArraySubset};
+use zarrs::filesystem::FilesystemStore;
+use zarrs::storage::store::MemoryStore;
+use zarrs::storage::{StoreKey, WritableStorageTraits};
+
+use super::*;
+use crate::maybe_send::{BoxFuture, BoxStream};
+use crate::memory::ArraySource;
+use crate::{Change, Chunk, ChunkError, ChunkId};
+
+fn run<T>(test: impl Future<Output = T>) -> T {
+    let runtime = tokio::runtime::Builder::new_current_thread();
+    { runtime }.enable_all().build().unwrap().block_on(test)
+}
+
+/// Two channels of 16 bit; what a voxel is worth follows from where it is. Nothing was acquired below
+/// z = 4 of level 0's first channel.
+struct Formula {
+    volume: Arc<Volume>,
+    failures: AtomicU32,
+    transient: bool,
+}
+
+impl Formula {
+    fn new(failures: u32, transient: bool) -> Arc<Self> {
+        let extent = UVec3::new(75, 53, 13);
+        let mut volume = Volume::new("em", extent, DVec3::new(4.0, 4.0, 8.0)).unwrap();
+        volume.channels = ["a", "b", "c"].map(Into::into).into();
+        volume.dtype = Dtype::Uint16;
+        volume.chunk = UVec3::new(9, 8, 4);
+        Arc::new(Self {
+            volume: Arc::new(volume),
+            failures: AtomicU32::new(failures),
+            transient,
+        })
+    }
+
+    fn value(level: u32, channel: u32, at: UVec3) -> u16 {
+        if level == 0 && channel == 0 && at.z < 4 {
+            return 0;
+        }
+        let mixed = (at.x * 7 + at.y * 131 + at.z * 1009 + level * 17 + channel * 4099) % 65_521;
+        u16::try_from(mixed).unwrap() + 1
+    }
+}
+
+impl VolumeSource for Formula {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.volume
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        Box::pin(async move {
+            let one_less = |left: u32| left.checked_sub(1);
+            let (set, get) = (Ordering::SeqCst, Ordering::SeqCst);
+            if self.failures.fetch_update(set, get, one_less).is_ok() {
+                return Err(ChunkError::Failed {
+                    id,
+                    transient: self.transient,
+                    source: Arc::new(std::io::Error::other("no luck")),
+                });
+            }
+            let inside = id
+                .voxels(&self.volume)
+                .ok_or(ChunkError::OutOfRange { id })?;
+            let min = id.chunk * self.volume.chunk;
+            let mut bytes = Vec::new();
+            for at in VoxelBox::new(min, min + self.volume.chunk).iter() {
+                let value = if inside.contains(at) {
+                    Self::value(id.level, id.channel, at)
+                } else {
+                    0
+                };
+                bytes.extend(value.to_le_bytes());
+            }
+            Ok(if bytes.iter().all(|byte| *byte == 0) {
+                Chunk::Empty
+            } else {
+                Chunk::Voxels(bytes.into())
+            })
+        })
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        stream::pending().boxed()
+    }
+}
+
+/// All values of a channel of a level, as another library reads them, x fastest.
+fn read_back(folder: &Path, level: usize, channel: u64) -> (UVec3, Vec<u16>) {
+    let store = Arc::new(FilesystemStore::new(folder).unwrap());
+    let array = Array::open(store, &format!("/{level}")).unwrap();
+    let [_, z, y, x] = array.shape()[..] else {
+        panic!("not four axes")
+    };
+    let all = ArraySubset::new_with_ranges(&[channel..channel + 1, 0..z, 0..y, 0..x]);
+    let values = array.retrieve_array_subset::<Vec<u16>>(&all).unwrap();
+    let size = [x, y, z].map(|n| u32::try_from(n).unwrap());
+    (UVec3::from_array(size), values)
+}
+
+fn group(folder: &Path) -> serde_json::Value {
+    serde_json::from_slice(&std::fs::read(folder.join("zarr.json")).unwrap()).unwrap()
+}
+
+#[test]
+fn every_voxel_of_every_level_is_where_it_was() {
+    let parts = [
+        (None, None, 0),
+        (
+            Some(VoxelBox::new(UVec3::new(11, 3, 5), UVec3::new(58, 999, 12))),
+            Some(vec![2, 0]),
+            0,
+        ),
+        (
+            Some(VoxelBox::new(UVec3::new(31, 17, 2), UVec3::new(32, 18, 3))),
+            Some(vec![1]),
+            1,
+        ),
+    ];
+    for (region, channels, finest) in parts {
+        let folder = tempfile::tempdir().unwrap();
+        let source: Arc<dyn VolumeSource> = Formula::new(0, true);
+        let options = ExportOptions {
+            region,
+            channels: channels.clone(),
+            finest,
+            ..ExportOptions::default()
+        };
+        let storage = LocalStorage::new(folder.path()).unwrap();
+        let done = run(export(&source, &storage, &options, &|_| {})).unwrap();
+        assert_eq!((done.done, done.again, done.kept), (done.shards, 0, 0));
+
+        let volume = source.volume();
+        let whole = VoxelBox::of_size(volume.extent());
+        let part = region.unwrap_or(whole).intersection(whole);
+        let image = &group(folder.path())["attributes"]["ome"]["multiscales"][0];
+        let datasets = image["datasets"].as_array().unwrap();
+        for (n, dataset) in datasets.iter().enumerate() {
+            let level = finest + u32::try_from(n).unwrap();
+            let geometry = volume.levels[level as usize];
+            let voxels = geometry.box_from_voxels(part);
+            let transforms = &dataset["coordinateTransformations"];
+            let placed = |axis: usize, i: usize| {
+                let scale = transforms[0]["scale"][axis].as_f64().unwrap();
+                let moved = transforms[1]["translation"][axis].as_f64().unwrap_or(0.0);
+                // The first edge, from that of the volume [level-0 voxels].
+                let edge = (moved - scale / 2.0) / volume.voxel_nm[i] + 0.5;
+                assert_eq!(edge, f64::from(voxels.min[i]) * geometry.downsampling[i]);
+                assert_eq!(scale, volume.voxel_nm[i] * geometry.downsampling[i]);
+            };
+            for (axis, i) in [(3, 0), (2, 1), (1, 2)] {
+                placed(axis, i);
+            }
+            for (c, channel) in channels
+                .clone()
+                .unwrap_or(vec![0, 1, 2])
+                .into_iter()
+                .enumerate()
+            {
+                let (size, values) = read_back(folder.path(), n, c as u64);
+                assert_eq!(size, voxels.size());
+                let expected = voxels.iter().map(|at| Formula::value(level, channel, at));
+                assert!(
+                    values.into_iter().eq(expected),
+                    "level {level} channel {channel}"
+                );
+            }
+        }
+        assert!(!folder.path().join(STATE).exists());
+    }
+}
+
+#[test]
+fn what_was_not_acquired_takes_no_space() {
+    let source: Arc<dyn VolumeSource> = Formula::new(0, true);
+    let region = VoxelBox::new(UVec3::ZERO, UVec3::new(75, 53, 3));
+    let options = ExportOptions {
+        region: Some(region),
+        channels: Some(vec![0]),
+        ..ExportOptions::default()
+    };
+    let storage = MemoryStorage::new();
+    let done = run(export(&source, &storage, &options, &|_| {})).unwrap();
+    assert!(done.empty > 0 && done.empty < done.shards, "{done:?}");
+    let shards = |level: u32| run(storage.list(&format!("{level}/c/"))).unwrap();
+    assert_eq!(shards(0), Vec::<String>::new());
+    assert!(!shards(1).is_empty());
+}
+
+fn names(storage: &dyn Storage) -> Vec<String> {
+    run(storage.list("")).unwrap()
+}
+
+/// Names of all objects, and the image in them, decoded: where chunks are in a shard is left to chance.
+fn image(storage: &dyn Storage) -> (Vec<String>, Vec<Vec<u8>>) {
+    let (names, store) = (names(storage), Arc::new(MemoryStore::new()));
+    for name in &names {
+        let bytes = run(storage.read(name, None)).unwrap();
+        store.set(&StoreKey::new(name).unwrap(), bytes).unwrap();
+    }
+    let arrays = names
+        .iter()
+        .filter_map(|name| name.strip_suffix("/zarr.json"));
+    let levels = arrays.map(|level| {
+        let array = Array::open(store.clone(), &format!("/{level}")).unwrap();
+        let all = array.subset_all();
+        let bytes = array.retrieve_array_subset::<ArrayBytes<'_>>(&all).unwrap();
+        bytes.into_fixed().unwrap().into_owned()
+    });
+    let levels = levels.collect();
+    (names, levels)
+}
+
+#[test]
+fn an_export_that_was_killed_goes_on() {
+    let source: Arc<dyn VolumeSource> = Formula::new(0, true);
+    let options = ExportOptions::default();
+    let whole = MemoryStorage::new();
+    let all = run(export(&source, &whole, &options, &|_| {})).unwrap();
+    let expected = image(&whole);
+    assert!(expected.1.len() > 1 && expected.1.iter().all(|level| level.iter().any(|v| *v != 0)));
+    let mut kept = Vec::new();
+    for nth in 0..expected.0.len() as u64 + 1 {
+        for fault in [WriteFault::CrashBefore, WriteFault::Full] {
+            let inner = Arc::new(MemoryStorage::new());
+            let storage = FaultyStorage::new(inner.clone());
+            storage.fail_write(nth, fault);
+            let failed = run(export(&source, &storage, &options, &|_| {}));
+            let Err(ExportError::Write { .. }) = failed else {
+                panic!("write {nth}: {failed:?}")
+            };
+            let whole = names(&*inner).contains(&GROUP.to_owned());
+            assert!(!whole, "taken for whole after write {nth}");
+            storage.restart();
+            let done = run(export(&source, &storage, &options, &|_| {})).unwrap();
+            assert!(image(&*inner) == expected, "after write {nth}");
+            assert_eq!((done.shards, done.done), (all.shards, all.shards));
+            kept.push(done.kept);
+        }
+    }
+    assert_eq!(kept.iter().max(), Some(&(all.shards - all.empty)));
+}
+
+#[test]
+fn what_is_there_is_not_mixed_with_something_else() {
+    let source: Arc<dyn VolumeSource> = Formula::new(0, true);
+    let options = ExportOptions::default();
+    let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
+    storage.fail_write(3, WriteFault::Fail);
+    run(export(&source, &storage, &options, &|_| {})).unwrap_err();
+    let other = ExportOptions {
+        compression: 0,
+        ..options.clone()
+    };
+    let refused = run(export(&source, &storage, &other, &|_| {}));
+    assert!(
+        matches!(refused, Err(ExportError::Other { .. })),
+        "{refused:?}"
+    );
+    run(export(&source, &storage, &options, &|_| {})).unwrap();
+    let refused = run(export(&source, &storage, &options, &|_| {}));
+    assert!(matches!(refused, Err(ExportError::Exists)), "{refused:?}");
+}
+
+#[test]
+fn passing_failures_are_waited_out_and_others_named() {
+    let options = ExportOptions {
+        retry: Duration::from_millis(1),
+        ..ExportOptions::default()
+    };
+    let source: Arc<dyn VolumeSource> = Formula::new(7, true);
+    run(export(&source, &MemoryStorage::new(), &options, &|_| {})).unwrap();
+    for (failures, transient) in [(1, false), (100_000, true)] {
+        let source: Arc<dyn VolumeSource> = Formula::new(failures, transient);
+        let failed = run(export(&source, &MemoryStorage::new(), &options, &|_| {}));
+        let Err(ExportError::Read { source }) = failed else {
+            panic!("{failed:?}")
+        };
+        assert!(source.to_string().contains("chunk"), "{source}");
+    }
+}
+
+#[test]
+fn what_cannot_be_is_refused_in_words() {
+    let source: Arc<dyn VolumeSource> = Formula::new(0, true);
+    let refused = |options: ExportOptions| {
+        let storage = MemoryStorage::new();
+        let refused = run(export(&source, &storage, &options, &|_| {})).unwrap_err();
+        assert!(names(&storage).is_empty(), "something was written");
+        refused.to_string()
+    };
+    let default = ExportOptions::default;
+    let outside = VoxelBox::new(UVec3::new(75, 0, 0), UVec3::new(80, 5, 5));
+    let options = ExportOptions {
+        region: Some(outside),
+        ..default()
+    };
+    assert!(refused(options).contains("75"));
+    for channels in [vec![3], vec![1, 1]] {
+        let options = ExportOptions {
+            channels: Some(channels),
+            ..default()
+        };
+        assert!(refused(options).contains("a, b, c"));
+    }
+    let options = ExportOptions {
+        finest: 9,
+        ..default()
+    };
+    assert!(refused(options).contains("0 to "));
+}
+
+fn array(extent: UVec3) -> ArraySource {
+    let mut volume = Volume::new("em", extent, DVec3::splat(8.0)).unwrap();
+    volume.chunk = UVec3::splat(16);
+    let voxels = VoxelBox::of_size(extent).iter();
+    let values = voxels.map(|at| u8::try_from((at.x * 3 + at.y + at.z) % 199 + 1).unwrap());
+    ArraySource::new(volume, values.collect()).unwrap()
+}
+
+#[test]
+fn what_changes_meanwhile_is_exported_again() {
+    let extent = UVec3::new(300, 40, 20);
+    let fixed = array(extent);
+    let live = Arc::new(array(extent));
+    let changed = VoxelBox::new(UVec3::new(290, 3, 3), UVec3::new(295, 9, 8));
+    let new_values = vec![77; usize::try_from(changed.voxels()).unwrap()];
+    fixed.set(changed, &new_values).unwrap();
+    let expected = MemoryStorage::new();
+    let fixed: Arc<dyn VolumeSource> = Arc::new(fixed);
+    run(export(
+        &fixed,
+        &expected,
+        &ExportOptions::default(),
+        &|_| {},
+    ))
+    .unwrap();
+
+    let storage = MemoryStorage::new();
+    let source: Arc<dyn VolumeSource> = live.clone();
+    let when = Mutex::new(Some(()));
+    let changes_late = |at: ExportProgress| {
+        if at.done + 1 == at.shards && when.lock().unwrap().take().is_some() {
+            live.set(changed, &new_values).unwrap();
+        }
+    };
+    let done = run(export(
+        &source,
+        &storage,
+        &ExportOptions::default(),
+        &changes_late,
+    ))
+    .unwrap();
+    assert!(done.again > 0 && done.again < done.shards / 2, "{done:?}");
+    assert_eq!(done.done, done.shards);
+    assert!(image(&storage) == image(&expected), "a mixture of states");
+    let before: Arc<dyn VolumeSource> = Arc::new(array(extent));
+    let other = MemoryStorage::new();
+    run(export(&before, &other, &ExportOptions::default(), &|_| {})).unwrap();
+    assert!(
+        image(&other) != image(&expected),
+        "the change does not show"
+    );
+
+    // One that was begun before a change is begun anew.
+    let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
+    storage.fail_write(4, WriteFault::Fail);
+    run(export(
+        &source,
+        &storage,
+        &ExportOptions::default(),
+        &|_| {},
+    ))
+    .unwrap_err();
+    live.set(changed, &new_values).unwrap();
+    let done = run(export(
+        &source,
+        &storage,
+        &ExportOptions::default(),
+        &|_| {},
+    ))
+    .unwrap();
+    assert_eq!(done.kept, 0);
+}

@@ -1,0 +1,193 @@
+//! `saccade export`: a volume, or a part of one, as files that need no Saccade.
+
+use anyhow::Result;
+use clap::Args;
+use glam::UVec3;
+use indicatif::{ProgressBar, ProgressStyle};
+use saccade_archive::StorageLocation;
+use saccade_core::voxel_box::VoxelBox;
+use saccade_source::export::{ExportOptions, ExportProgress, export};
+
+use crate::arguments::CatalogArgument;
+use crate::interrupt::interrupted;
+use crate::open::Place;
+use crate::report::say;
+use crate::stitching::Stitching;
+
+/// A list of channels, in one argument.
+#[derive(Clone)]
+struct Channels(Vec<u32>);
+
+fn channels(text: &str) -> Result<Channels, String> {
+    let numbers = text.split(',').map(|n| n.trim().parse::<u32>());
+    let numbers: Result<_, _> = numbers.collect();
+    let wrong = |_| format!("{text:?} is no list of channels, as 0,2");
+    Ok(Channels(numbers.map_err(wrong)?))
+}
+
+fn region(text: &str) -> Result<VoxelBox, String> {
+    let numbers = text.split(',').map(|n| n.trim().parse::<u32>().ok());
+    let numbers: Option<Vec<u32>> = numbers.collect();
+    let Some(&[x0, y0, z0, x1, y1, z1]) = numbers.as_deref() else {
+        return Err(format!("{text:?} is not six whole numbers, x,y,z,x,y,z"));
+    };
+    let region = VoxelBox::new(UVec3::new(x0, y0, z0), UVec3::new(x1, y1, z1));
+    if region.is_empty() {
+        return Err("the second corner is not beyond the first on every axis".to_owned());
+    }
+    Ok(region)
+}
+
+/// Write a volume, or a part of it, as an OME-Zarr 0.5 image with shards. An export that was
+/// interrupted goes on when it is begun again.
+#[derive(Args)]
+pub(crate) struct Export {
+    /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
+    /// --catalog; or the folder of an OME-Zarr image
+    #[arg(value_name = "URL|ARCHIVE|IMAGE")]
+    place: Place,
+
+    /// Where the image is to be: an empty or new folder, or s3://bucket/prefix
+    #[arg(value_name = "OUT")]
+    out: StorageLocation,
+
+    #[command(flatten)]
+    catalog: CatalogArgument,
+
+    /// Name of the volume [default: the first]
+    #[arg(long)]
+    volume: Option<String>,
+
+    /// A part only: the first voxel, and the one beyond the last on every axis [voxels of the finest
+    /// level] [default: all of it]
+    #[arg(long, value_name = "X,Y,Z,X,Y,Z", value_parser = region)]
+    region: Option<VoxelBox>,
+
+    /// Channels, as numbers from 0 with commas [default: all]
+    #[arg(long, value_name = "N,...", value_parser = channels)]
+    channels: Option<Channels>,
+
+    /// The volume's level that becomes the finest of the image; each halves the resolution
+    #[arg(long, value_name = "LEVEL", default_value_t = 0)]
+    finest: u32,
+
+    /// How hard zstd compresses, 1 (fast) to 22 (small); 0 does not
+    #[arg(long, value_name = "LEVEL", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=22))]
+    compression: u8,
+
+    #[command(flatten)]
+    stitching: Stitching,
+}
+
+impl Export {
+    pub(crate) async fn run(self) -> Result<()> {
+        let volume = self.volume.as_deref();
+        let opened = self.place.open(&self.catalog, volume, &self.stitching);
+        let source = opened.await?.source;
+        let storage = self.out.open().await?;
+        let options = ExportOptions {
+            region: self.region,
+            channels: self.channels.map(|Channels(list)| list),
+            finest: self.finest,
+            compression: self.compression,
+            ..ExportOptions::default()
+        };
+        // Draws nothing where there is no terminal.
+        let bar = ProgressBar::new(0).with_style(
+            ProgressStyle::with_template("{bar:32} {pos}/{len} shards, {msg}, {eta} left")
+                .unwrap_or_else(|_| ProgressStyle::default_bar()),
+        );
+        let show = |progress: ExportProgress| {
+            bar.set_length(progress.shards);
+            bar.set_position(progress.done);
+            bar.set_message(megabytes(progress.bytes));
+        };
+        let exporting = export(&source, &*storage, &options, &show);
+        let done = tokio::select! {
+            done = exporting => done,
+            () = interrupted() => {
+                bar.finish_and_clear();
+                say("interrupted; the same command goes on with the export");
+                return Ok(());
+            }
+        };
+        bar.finish_and_clear();
+        let done = done?;
+        if let StorageLocation::Folder(folder) = &self.out {
+            // Empty now, and no part of the image.
+            drop(std::fs::remove_dir(folder.join(".incoming")));
+        }
+        say(&summary(&done, bar.elapsed().as_secs_f64()));
+        Ok(())
+    }
+}
+
+fn summary(done: &ExportProgress, seconds: f64) -> String {
+    let mut parts = vec![format!(
+        "exported {} in {seconds:.0} s: {} shards",
+        megabytes(done.bytes),
+        done.shards - done.again,
+    )];
+    for (count, what) in [
+        (done.kept, "were there already"),
+        (done.empty, "hold nothing"),
+        (done.again, "changed meanwhile and were exported again"),
+    ] {
+        if count > 0 {
+            parts.push(format!("{count} {what}"));
+        }
+    }
+    parts.join(", ")
+}
+
+fn megabytes(bytes: u64) -> String {
+    format!("{:.1} MB", bytes as f64 / 1e6)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regions_have_two_corners() {
+        let read = region("1, 2,3,4,5,6").unwrap();
+        assert_eq!(
+            (read.min, read.max),
+            (UVec3::new(1, 2, 3), UVec3::new(4, 5, 6))
+        );
+        for wrong in [
+            "",
+            "1,2,3",
+            "1,2,3,1,5,6",
+            "1,2,3,4,5,-6",
+            "1,2,3,4,5,6,7",
+            "a,2,3,4,5,6",
+        ] {
+            assert!(region(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn channels_are_a_list() {
+        assert_eq!(channels("2, 0").unwrap().0, [2, 0]);
+        for wrong in ["", "a", "1,,2", "-1"] {
+            assert!(channels(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn what_was_done_is_told() {
+        let done = ExportProgress {
+            shards: 12,
+            done: 12,
+            kept: 3,
+            again: 2,
+            bytes: 2_500_000,
+            ..ExportProgress::default()
+        };
+        assert_eq!(
+            summary(&done, 4.0),
+            "exported 2.5 MB in 4 s: 10 shards, 3 were there already, 2 changed meanwhile and were exported again"
+        );
+    }
+}
