@@ -43,6 +43,7 @@ struct LeafBlock {
 // The one used last, per channel: most bricks along a ray share it.
 var<private> last: array<LeafBlock, SLOTS>;
 
+// Entries read, of the directory and of page tables.
 var<private> lookups: u32;
 var<private> misses_left: u32 = max(MISSES_PER_RAY, MISSES_PER_CHANNEL * SLOTS);
 
@@ -91,7 +92,6 @@ fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
 }
 
 fn find(channel: u32, level: u32, brick: vec3u) -> Found {
-    lookups += 1u;
     let edge = frame.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
     let block_at = brick >> vec3u(edge);
@@ -106,6 +106,7 @@ fn find(channel: u32, level: u32, brick: vec3u) -> Found {
         let base = frame.channels[channel].directory_offset + frame.levels[level].directory_base;
         physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
         value = directory[physical];
+        lookups += 1u;
     }
     if (value & ~STALE) >= FIRST_SLOT && span > 0u {
         loop {
@@ -122,6 +123,7 @@ fn find(channel: u32, level: u32, brick: vec3u) -> Found {
             let entry = (block << (3u * edge)) + ((((at.z << edge) + at.y) << edge) + at.x);
             physical = frame.directory_entries + entry;
             value = tables[entry];
+        lookups += 1u;
             continuing {
                 break if span == 0u || (value & ~STALE) < FIRST_SLOT;
             }
