@@ -24,7 +24,9 @@
 //!   in size, with the tile's edge pixels repeated outward; it is at least 1. Where no tile is: 0.
 //! - Where a voxel is larger than the pixels of a tile's coarsest level, it is the mean of 2 x 2,
 //!   4 x 4, at most 16 x 16 such samples, those that are 0 left out. The largest tile pixels near
-//!   decide how many; where tiles of a section differ in size, it is the same number for all.
+//!   decide how many; where tiles of a section differ in size, it is the same number for all. Coarsest
+//!   levels stay in memory when their pyramids are closed, and on disk over restarts: coarse
+//!   voxels open each pyramid once.
 //!
 //! # Changes
 //!
@@ -47,6 +49,7 @@ mod error;
 mod follow;
 mod index;
 mod resample;
+mod thumbnails;
 mod tiles;
 
 use std::sync::Arc;
@@ -86,6 +89,9 @@ pub struct StitchedOptions {
     pub sub_tile_bytes: u64,
     /// Memory for the indices of pyramids \[bytes\].
     pub index_bytes: u64,
+    /// Memory for the coarsest levels of tiles' pyramids \[bytes\], 16 or 32 kB each: all that levels show whose
+    /// voxels are larger than their pixels.
+    pub thumbnail_bytes: u64,
     /// Memory for where the tiles of sections lie \[bytes\]: about 300 for each tile of those looked at
     /// last.
     pub section_bytes: u64,
@@ -99,7 +105,7 @@ pub struct StitchedOptions {
     pub along_z: AlongZ,
     /// What is shown in place of sections that have no tile.
     pub gaps: Gaps,
-    /// Keeps finished blocks over restarts. For archives that can be written, which then get an object
+    /// Keeps finished blocks and coarsest levels of pyramids over restarts. For archives that can be written, which then get an object
     /// `identity` that tells them from others.
     pub disk_cache: Option<DiskCache>,
     /// How long chunks fail that show a tile which cannot be read, until it is tried again.
@@ -112,6 +118,7 @@ impl Default for StitchedOptions {
             block_bytes: 512 << 20,
             sub_tile_bytes: 256 << 20,
             index_bytes: 64 << 20,
+            thumbnail_bytes: 128 << 20,
             section_bytes: 256 << 20,
             interpolation: Interpolation::Linear,
             overlaps: Overlaps::NearestCentre,
@@ -136,6 +143,10 @@ pub struct StitchedStatistics {
     pub voxels_built: u64,
     /// Pyramids opened since it was opened, also those opened again.
     pub pyramids_opened: u64,
+    /// Coarsest levels of pyramids found in the cache on disk since it was opened.
+    pub thumbnails_from_disk: u64,
+    /// Memory that coarsest levels of pyramids take \[bytes\].
+    pub thumbnail_bytes: u64,
     /// Sub-tiles decoded since it was opened.
     pub sub_tiles_decoded: u64,
     /// Memory that finished blocks take \[bytes\].
@@ -214,7 +225,6 @@ impl StitchedSource {
         let index = TileIndex::open(&catalog, name, options.section_bytes)
             .await
             .map_err(failed)?;
-        let tiles = Tiles::new(archive, index, volume.dtype, &options);
         let disk = match options.disk_cache.clone() {
             Some(disk) => {
                 let place = catalog.location().to_string();
@@ -223,6 +233,7 @@ impl StitchedSource {
             }
             None => None,
         };
+        let tiles = Tiles::new(archive, index, volume.dtype, disk.clone(), &options);
         let inner = Arc::new(Inner {
             disk,
             from_disk: AtomicU64::new(0),

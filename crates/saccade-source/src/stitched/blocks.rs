@@ -175,12 +175,15 @@ impl Inner {
         let plan = self.builder.plan(place).await?;
         let description = self.builder.description(place, &plan);
         let description = [identity, description.as_bytes()].concat();
-        if let Some(block) = disk.get(&description).await {
+        let kept = disk.get(&description).await;
+        if let Some(block) = kept.and_then(|bytes| Block::from_bytes(&bytes)) {
             self.from_disk.fetch_add(1, Ordering::Relaxed);
             return Ok(block);
         }
         let block = self.builder.block(&self.grid, place, Some(&plan)).await?;
-        disk.put(&description, &block);
+        if let Some(bytes) = block.to_bytes() {
+            disk.put(&description, &bytes);
+        }
         Ok(block)
     }
 

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use futures::FutureExt;
 use futures::future::{join_all, try_join, try_join_all};
 use futures::stream::{self, StreamExt, TryStreamExt};
 use glam::DVec2;
@@ -22,7 +23,7 @@ use super::coverage::{Candidate, Grid, Overlaps, Segment, Uncovered};
 use super::error::StitchError;
 use super::index::IndexedTile;
 use super::resample::{Interpolation, Sample, averaged};
-use super::tiles::Tiles;
+use super::tiles::{Image, Tiles};
 use super::{StitchedOptions, StitchedStatistics};
 use crate::ValueRange;
 
@@ -30,6 +31,8 @@ use crate::ValueRange;
 const FINEST_SAMPLING: u32 = 4;
 /// Sections of a block on which work is under way.
 const SECTIONS_AT_ONCE: usize = 4;
+/// Tiles of a section whose values are looked up for the bounds of a box, at most.
+const MOST_BOUNDS: usize = 64;
 
 pub(super) struct Builder {
     volume: Arc<Volume>,
@@ -98,6 +101,8 @@ impl Builder {
             voxels_built: self.voxels.load(Ordering::Relaxed),
             pyramids_opened: self.tiles.opened(),
             sub_tiles_decoded: self.tiles.decoded(),
+            thumbnails_from_disk: self.tiles.thumbnails_from_disk(),
+            thumbnail_bytes: self.tiles.thumbnail_bytes(),
             tiles_indexed: index.tiles(),
             section_bytes: index.bytes(),
             ..StitchedStatistics::default()
@@ -243,10 +248,16 @@ impl Builder {
             }
             let grid =
                 *planned.get_or_insert_with(|| whole.finer(1 << sampling(&near, whole.step)));
-            let opened = near.iter().map(|tile| self.tiles.pyramid(tile));
-            let opened = try_join_all(opened).await?;
-            let candidates = near.into_iter().zip(opened);
-            let candidates = candidates.map(|(tile, pyramid)| Candidate::new(tile, pyramid, &grid));
+            // To open so many costs more than it saves to know what they show.
+            if near.len() > MOST_BOUNDS {
+                return Ok(Some((1, u16::MAX)));
+            }
+            let opened = near.into_iter().map(async |tile| {
+                let level = grid.level_of(&tile);
+                let image = self.tiles.bounds(&tile, level).await?;
+                Ok(Candidate::new(tile, image, level))
+            });
+            let candidates = try_join_all(opened).await?.into_iter();
             let ranges = candidates.map(|candidate| {
                 let (seen, covers) = candidate.range(&grid, self.rules.interpolation);
                 (candidate, seen, covers)
@@ -376,11 +387,16 @@ impl Builder {
                     (grid, uncovered)
                 }
             };
-            let opened = join_all(near.iter().map(|tile| self.tiles.pyramid(tile))).await;
+            let opened = near.iter().map(|tile| {
+                let of_pyramid = grid.level_of(tile);
+                let image = self.tiles.image(tile, of_pyramid);
+                image.map(move |image| (of_pyramid, image))
+            });
+            let opened = join_all(opened).await;
             let mut candidates = Vec::new();
-            for (tile, pyramid) in near.into_iter().zip(opened) {
-                match pyramid {
-                    Ok(pyramid) => candidates.push(Candidate::new(tile, pyramid, &grid)),
+            for (tile, (of_pyramid, image)) in near.into_iter().zip(opened) {
+                match image {
+                    Ok(image) => candidates.push(Candidate::new(tile, image, of_pyramid)),
                     Err(error) => failures.push(Failure::bounds(error, &tile, level, voxels)),
                 }
             }
@@ -402,9 +418,13 @@ impl Builder {
         let fetched = parts.into_iter().map(async |part: Part| {
             let (candidate, interpolation) = (&part.candidate, rules.interpolation);
             let wanted = candidate.sub_tiles(&grid, &part.segments, interpolation);
-            let (pyramid, section) = (&candidate.pyramid, candidate.tile.section);
-            let fetched = self.tiles.fetch(pyramid, section, candidate.level, wanted);
-            let fetched = fetched.await;
+            let fetched = match &candidate.image {
+                Image::Thumbnail(thumbnail) => Ok(thumbnail.fetched(&wanted)),
+                Image::Pyramid(pyramid) => {
+                    let section = candidate.tile.section;
+                    { self.tiles.fetch(pyramid, section, candidate.level, wanted) }.await
+                }
+            };
             (part, fetched)
         });
         let fetched = join_all(fetched).await;

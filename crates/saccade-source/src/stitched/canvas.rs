@@ -43,7 +43,7 @@ impl<S: Sample> Canvas<S> {
         let candidate = &part.candidate;
         let decode = |(at, fetched)| {
             let (section, level) = (candidate.tile.section, candidate.level);
-            let voxels = tiles.decode(&candidate.pyramid, section, level, at, fetched)?;
+            let voxels = tiles.decode(section, level, at, fetched)?;
             Ok((at, voxels))
         };
         let decoded: Result<Vec<_>, StitchError> = fetched.into_par_iter().map(decode).collect();

@@ -11,7 +11,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::index::IndexedTile;
 use super::resample::Interpolation;
-use super::tiles::Pyramid;
+use super::tiles::Image;
 
 /// Of the tiles at a sample, those take part whose pixels are at most so many times as large as the
 /// smallest ones there \[003 §3.3\].
@@ -56,6 +56,11 @@ impl Grid {
         }
     }
 
+    /// The level of a tile's pyramid that suits it.
+    pub(super) fn level_of(&self, tile: &IndexedTile) -> u32 {
+        tile.wanted_level(self.step).min(tile.coarsest_level())
+    }
+
     /// Where sample (x, y) sits \[level-0 voxels\].
     pub(super) fn point(&self, x: u32, y: u32) -> DVec2 {
         ((self.first.as_dvec2() + DVec2::new(f64::from(x), f64::from(y))) + 0.5) * self.step
@@ -80,23 +85,19 @@ pub(super) struct Segment {
 #[derive(Clone)]
 pub(super) struct Candidate {
     pub(super) tile: Arc<IndexedTile>,
-    pub(super) pyramid: Arc<Pyramid>,
+    pub(super) image: Image,
     /// The level of the pyramid that suits the grid.
     pub(super) level: u32,
 }
 
 impl Candidate {
-    pub(super) fn new(tile: Arc<IndexedTile>, pyramid: Arc<Pyramid>, grid: &Grid) -> Self {
-        let level = tile.wanted_level(grid.step).min(tile.coarsest_level());
-        Self {
-            tile,
-            pyramid,
-            level,
-        }
+    /// Of a tile, drawn from an image at a level that suits the grid, see [`Grid::level_of`].
+    pub(super) fn new(tile: Arc<IndexedTile>, image: Image, level: u32) -> Self {
+        Self { tile, image, level }
     }
 
     pub(super) fn size(&self) -> PyramidLevel {
-        self.pyramid.index.levels()[self.level as usize]
+        self.image.level(self.level)
     }
 
     /// Position \[pixels of the level\] of a sample; pixel `i` covers `[i, i + 1)`.
@@ -141,7 +142,7 @@ impl Candidate {
             return (None, false);
         }
         let reach = interpolation.reach();
-        let (range, blanks) = self.pyramid.range(self.level, min, max, reach);
+        let (range, blanks) = self.image.range(self.level, min, max, reach);
         let range = range.map(|range| interpolation.bounds(range));
         (range, !blanks && corners.into_iter().all(inside))
     }
@@ -154,12 +155,12 @@ impl Candidate {
         row: Range<u32>,
         mut keep: impl FnMut(Range<u32>),
     ) {
-        if !self.pyramid.has_blanks(self.level) {
+        if !self.image.has_blanks(self.level) {
             return keep(row);
         }
         let mut start = None;
         for x in row.clone() {
-            let seen = !self.pyramid.is_blank_at(self.level, self.pixel(grid, x, y));
+            let seen = !self.image.is_blank_at(self.level, self.pixel(grid, x, y));
             match (seen, start) {
                 (true, None) => start = Some(x),
                 (false, Some(first)) => {

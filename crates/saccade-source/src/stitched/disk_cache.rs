@@ -1,4 +1,4 @@
-//! Finished blocks on a local disk, for the next time.
+//! Finished blocks and tiles' thumbnails on a local disk, for the next time.
 //!
 //! # Nothing stale
 //!
@@ -6,7 +6,7 @@
 //! revision, and of how they are stitched. The plan's whole description is kept with the block and
 //! compared with the present one before the block is used, so a tile that came, moved, was imaged
 //! again or deleted since makes it another block. What nobody asks for any more is written over in
-//! time, oldest first.
+//! time, oldest first. A thumbnail is a function of its pyramid, which never changes.
 //!
 //! # Failure
 //!
@@ -26,8 +26,6 @@ use foyer::{
     PsyncIoEngineConfig, RecoverMode,
 };
 use saccade_archive::storage::{Storage, StorageError};
-
-use super::block::Block;
 
 /// Unit in which the cache is written over \[bytes\]: several blocks of voxels.
 const UNIT: u64 = 64 << 20;
@@ -145,8 +143,8 @@ impl DiskCache {
         self.0.lock.read().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The block that was built from a plan of this description.
-    pub(super) async fn get(&self, description: &[u8]) -> Option<Block> {
+    /// What was made of what this description describes.
+    pub(super) async fn get(&self, description: &[u8]) -> Option<Bytes> {
         if self.open_still().is_none() {
             return None;
         }
@@ -163,18 +161,15 @@ impl DiskCache {
         let length = u64::from_le_bytes(*kept.first_chunk()?);
         let length = usize::try_from(length).ok()?.checked_add(8)?;
         let same = kept.get(8..length)? == description;
-        same.then(|| Block::from_bytes(&kept.slice(length..)))?
+        same.then(|| kept.slice(length..))
     }
 
-    /// Keeps a block that was built from a plan of this description.
-    pub(super) fn put(&self, description: &[u8], block: &Block) {
-        let Some(bytes) = block.to_bytes() else {
-            return;
-        };
+    /// Keeps what was made of what this description describes.
+    pub(super) fn put(&self, description: &[u8], bytes: &[u8]) {
         let mut kept = BytesMut::with_capacity(8 + description.len() + bytes.len());
         kept.put_u64_le(description.len() as u64);
         kept.put_slice(description);
-        kept.put_slice(&bytes);
+        kept.put_slice(bytes);
         // Held over the insertion, so that closing begins before it or waits for what it wrote.
         let open = self.open_still();
         if open.is_some() {
@@ -184,7 +179,7 @@ impl DiskCache {
     }
 }
 
-/// Blocks whose descriptions have the same key take each other's place.
+/// Two whose descriptions have the same key take each other's place.
 fn key(description: &[u8]) -> u64 {
     // FNV-1a: the same in every build of the program.
     description

@@ -1,6 +1,7 @@
 #![allow(clippy::cast_possible_truncation, reason = "test volumes are small")]
 
 mod changes;
+mod coarse;
 mod disk;
 mod failures;
 mod fixture;

@@ -4,15 +4,17 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::StitchedOptions;
+use super::disk_cache::DiskCache;
 use super::error::StitchError;
 use super::index::{IndexedTile, TileIndex};
+use super::thumbnails::Thumbnail;
 use bytes::Bytes;
 use futures::future::try_join_all;
 use glam::{DVec2, UVec2};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use saccade_archive::VisualizationArchive;
-use saccade_archive::pyramid::{PyramidIndex, SUB_TILE_EDGE, SUB_TILE_VOXELS};
+use saccade_archive::pyramid::{PyramidIndex, PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_archive::storage::Storage;
 use saccade_core::volume::Dtype;
 use tokio::sync::Semaphore;
@@ -107,8 +109,56 @@ pub(super) struct SubTileKey {
 /// A sub-tile as it was read or, better, as it was decoded before or need not be.
 pub(super) enum Fetched {
     Constant(u16),
-    Encoded(Bytes),
+    /// Of this pyramid.
+    Encoded(Arc<Pyramid>, Bytes),
     Decoded(Bytes),
+}
+
+/// What is drawn of a tile.
+#[derive(Clone)]
+pub(super) enum Image {
+    Pyramid(Arc<Pyramid>),
+    /// Its coarsest level alone.
+    Thumbnail(Arc<Thumbnail>),
+}
+
+impl Image {
+    /// Size of a level, which of a thumbnail is its own.
+    pub(super) fn level(&self, level: u32) -> PyramidLevel {
+        match self {
+            Self::Pyramid(pyramid) => pyramid.index.levels()[level as usize],
+            Self::Thumbnail(thumbnail) => thumbnail.level(),
+        }
+    }
+
+    pub(super) fn has_blanks(&self, level: u32) -> bool {
+        match self {
+            Self::Pyramid(pyramid) => pyramid.has_blanks(level),
+            Self::Thumbnail(thumbnail) => thumbnail.is_blank(),
+        }
+    }
+
+    /// Whether a position \[pixels of the level\] is in a blank sub-tile.
+    pub(super) fn is_blank_at(&self, level: u32, pixel: DVec2) -> bool {
+        match self {
+            Self::Pyramid(pyramid) => pyramid.is_blank_at(level, pixel),
+            Self::Thumbnail(thumbnail) => thumbnail.is_blank(),
+        }
+    }
+
+    /// See [`Pyramid::range`].
+    pub(super) fn range(
+        &self,
+        level: u32,
+        min: DVec2,
+        max: DVec2,
+        reach: f64,
+    ) -> (Option<(u16, u16)>, bool) {
+        match self {
+            Self::Pyramid(pyramid) => pyramid.range(level, min, max, reach),
+            Self::Thumbnail(thumbnail) => (thumbnail.range(), thumbnail.is_blank()),
+        }
+    }
 }
 
 #[derive(Clone)]
@@ -117,6 +167,12 @@ struct Bytewise;
 impl Weighter<SubTileKey, Bytes> for Bytewise {
     fn weight(&self, _: &SubTileKey, voxels: &Bytes) -> u64 {
         voxels.len() as u64 + 64
+    }
+}
+
+impl Weighter<Box<str>, Arc<Thumbnail>> for Bytewise {
+    fn weight(&self, name: &Box<str>, thumbnail: &Arc<Thumbnail>) -> u64 {
+        (thumbnail.memory() + name.len() + 64) as u64
     }
 }
 
@@ -134,6 +190,10 @@ pub(super) struct Tiles {
     reads: Semaphore,
     pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
     sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
+    thumbnails: Cache<Box<str>, Arc<Thumbnail>, Bytewise>,
+    /// With what tells the archive from others.
+    disk: Option<(DiskCache, Vec<u8>)>,
+    from_disk: AtomicU64,
     next_serial: AtomicU64,
     decoded: AtomicU64,
 }
@@ -143,6 +203,7 @@ impl Tiles {
         archive: &VisualizationArchive,
         index: TileIndex,
         dtype: Dtype,
+        disk: Option<(DiskCache, Vec<u8>)>,
         options: &StitchedOptions,
     ) -> Self {
         let items = |bytes: u64, each: usize| {
@@ -165,6 +226,13 @@ impl Tiles {
                 options.sub_tile_bytes,
                 Bytewise,
             ),
+            thumbnails: Cache::with_weighter(
+                items(options.thumbnail_bytes, SUB_TILE_VOXELS),
+                options.thumbnail_bytes,
+                Bytewise,
+            ),
+            disk,
+            from_disk: AtomicU64::new(0),
             next_serial: AtomicU64::new(0),
             decoded: AtomicU64::new(0),
         }
@@ -175,43 +243,109 @@ impl Tiles {
         &self.index
     }
 
+    /// What is drawn of a tile at a level of its pyramid.
+    pub(super) async fn image(&self, tile: &IndexedTile, level: u32) -> Result<Image, StitchError> {
+        if level < tile.coarsest_level() {
+            return self.pyramid(tile).await.map(Image::Pyramid);
+        }
+        let make = self.thumbnail(tile);
+        let made = self.thumbnails.get_or_insert_async(&tile.pyramid, make);
+        made.await.map(Image::Thumbnail)
+    }
+
+    /// What tells a tile's values at a level, with nothing decoded.
+    pub(super) async fn bounds(
+        &self,
+        tile: &IndexedTile,
+        level: u32,
+    ) -> Result<Image, StitchError> {
+        let known = || self.thumbnails.get(&tile.pyramid);
+        match Some(level).filter(|level| *level >= tile.coarsest_level()) {
+            Some(_) if let Some(thumbnail) = known() => Ok(Image::Thumbnail(thumbnail)),
+            _ => self.pyramid(tile).await.map(Image::Pyramid),
+        }
+    }
+
     /// The pyramid of a tile, opened if it is not open.
-    pub(super) async fn pyramid(&self, tile: &IndexedTile) -> Result<Arc<Pyramid>, StitchError> {
-        let open = async {
-            let _turn = self.reads.acquire().await;
-            let opened = PyramidIndex::open(&*self.storage, &tile.pyramid).await;
-            let index = opened.map_err(|source| {
-                let section = tile.section;
-                StitchError::Tile { source, section }
-            })?;
-            let got = UVec2::new(index.levels()[0].width, index.levels()[0].height);
-            let levels = index.levels().len();
-            if index.dtype() != self.dtype {
-                return Err(StitchError::Dtype {
-                    expected: self.dtype,
-                    got: index.dtype(),
-                    name: tile.pyramid.to_string(),
-                });
-            }
-            if got != tile.size || levels <= tile.coarsest_level() as usize {
-                let (expected, name) = (tile.size, tile.pyramid.to_string());
-                return Err(StitchError::Size {
-                    expected,
-                    got,
-                    name,
-                });
-            }
-            let serial = self.next_serial.fetch_add(1, Ordering::Relaxed);
-            Ok(Arc::new(Pyramid::new(index, serial)))
-        };
+    async fn pyramid(&self, tile: &IndexedTile) -> Result<Arc<Pyramid>, StitchError> {
+        let open = self.open(tile);
         self.pyramids.get_or_insert_async(&tile.pyramid, open).await
+    }
+
+    async fn open(&self, tile: &IndexedTile) -> Result<Arc<Pyramid>, StitchError> {
+        let _turn = self.reads.acquire().await;
+        let opened = PyramidIndex::open(&*self.storage, &tile.pyramid).await;
+        let index = opened.map_err(|source| {
+            let section = tile.section;
+            StitchError::Tile { source, section }
+        })?;
+        let got = UVec2::new(index.levels()[0].width, index.levels()[0].height);
+        let levels = index.levels().len();
+        if index.dtype() != self.dtype {
+            return Err(StitchError::Dtype {
+                expected: self.dtype,
+                got: index.dtype(),
+                name: tile.pyramid.to_string(),
+            });
+        }
+        if got != tile.size || levels <= tile.coarsest_level() as usize {
+            let (expected, name) = (tile.size, tile.pyramid.to_string());
+            return Err(StitchError::Size {
+                expected,
+                got,
+                name,
+            });
+        }
+        let serial = self.next_serial.fetch_add(1, Ordering::Relaxed);
+        Ok(Arc::new(Pyramid::new(index, serial)))
+    }
+
+    /// The thumbnail of a tile: from the cache on disk, or read now.
+    async fn thumbnail(&self, tile: &IndexedTile) -> Result<Arc<Thumbnail>, StitchError> {
+        let kept = self.disk.as_ref().map(|(disk, identity)| {
+            let (name, size, dtype) = (&tile.pyramid, tile.size, self.dtype);
+            let description = format!("thumbnail 1 {name:?} {size:?} {dtype:?}");
+            (disk, [identity, description.as_bytes()].concat())
+        });
+        if let Some((disk, description)) = &kept
+            && let Some(bytes) = disk.get(description).await
+            && let Some(thumbnail) = Thumbnail::from_bytes(bytes, self.dtype)
+        {
+            self.from_disk.fetch_add(1, Ordering::Relaxed);
+            return Ok(Arc::new(thumbnail));
+        }
+        // Thousands of pyramids that are opened for this alone leave the others open.
+        let room = self.pyramids.weight() < self.pyramids.capacity() / 2;
+        let pyramid = match self.pyramids.get(&tile.pyramid) {
+            Some(pyramid) => pyramid,
+            None if room => self.pyramid(tile).await?,
+            None => self.open(tile).await?,
+        };
+        let level = tile.coarsest_level();
+        let PyramidLevel { width, height, .. } = pyramid.index.levels()[level as usize];
+        let size = UVec2::new(width, height);
+        let entry = pyramid.index.sub_tile(level as usize, 0, 0);
+        let range = entry.map_or((0, 0), |entry| (entry.min, entry.max));
+        let voxels = if range.0 == range.1 {
+            Bytes::new()
+        } else {
+            let wanted = vec![UVec2::ZERO];
+            let mut fetched = self.fetch(&pyramid, tile.section, level, wanted).await?;
+            let (_, fetched) = fetched.pop().expect("it is not blank");
+            self.decode(tile.section, level, UVec2::ZERO, fetched)?
+        };
+        let thumbnail = Thumbnail::new(size, range, voxels);
+        if let Some((disk, description)) = &kept {
+            disk.put(description, &thumbnail.to_bytes());
+        }
+        Ok(Arc::new(thumbnail))
     }
 
     /// Fetches sub-tiles of a level, neighbours together. Blank ones are left out; those of one value
     /// are known without a read.
     pub(super) async fn fetch(
         &self,
-        pyramid: &Pyramid,
+        pyramid: &Arc<Pyramid>,
         section: u32,
         level: u32,
         wanted: Vec<UVec2>,
@@ -246,7 +380,8 @@ impl Tiles {
                 if within.end > bytes.len() {
                     return Err(StitchError::Cut { name: name.into() });
                 }
-                fetched.push((*at, Fetched::Encoded(bytes.slice(within.clone()))));
+                let bytes = bytes.slice(within.clone());
+                fetched.push((*at, Fetched::Encoded(pyramid.clone(), bytes)));
             }
         }
         Ok(fetched)
@@ -255,16 +390,15 @@ impl Tiles {
     /// Decodes a fetched sub-tile to little-endian voxels, and remembers it.
     pub(super) fn decode(
         &self,
-        pyramid: &Pyramid,
         section: u32,
         level: u32,
         at: UVec2,
         fetched: Fetched,
     ) -> Result<Bytes, StitchError> {
-        let bytes = match fetched {
+        let (pyramid, bytes) = match fetched {
             Fetched::Constant(value) => return Ok(self.constant(value)),
             Fetched::Decoded(voxels) => return Ok(voxels),
-            Fetched::Encoded(bytes) => bytes,
+            Fetched::Encoded(pyramid, bytes) => (pyramid, bytes),
         };
         let decoded = pyramid
             .index
@@ -273,7 +407,7 @@ impl Tiles {
         let voxels = Bytes::from(voxels);
         self.decoded.fetch_add(1, Ordering::Relaxed);
         self.sub_tiles
-            .insert(key(pyramid, level, at), voxels.clone());
+            .insert(key(&pyramid, level, at), voxels.clone());
         Ok(voxels)
     }
 
@@ -287,6 +421,16 @@ impl Tiles {
     /// Sub-tiles decoded so far.
     pub(super) fn decoded(&self) -> u64 {
         self.decoded.load(Ordering::Relaxed)
+    }
+
+    /// Thumbnails found in the cache on disk so far.
+    pub(super) fn thumbnails_from_disk(&self) -> u64 {
+        self.from_disk.load(Ordering::Relaxed)
+    }
+
+    /// Memory that thumbnails take \[bytes\].
+    pub(super) fn thumbnail_bytes(&self) -> u64 {
+        self.thumbnails.weight()
     }
 
     /// Pyramids opened so far.

@@ -147,6 +147,15 @@ proptest! {
             let mut options = cached(folder.path()).await;
             let mut source = fixture.open_with(options.clone()).await;
             let mut changes = source.changes();
+            // Keeps nothing of what was built, and what it was built from as long as it may.
+            let keeping = StitchedOptions {
+                block_bytes: 0,
+                sub_tile_bytes: 0,
+                ..StitchedOptions::default()
+            };
+            let keeping = fixture.open_with(keeping).await;
+            read_all(&keeping).await;
+            let mut kept_changes = keeping.changes();
             let volume = fixture.volume.clone();
             let ids: Vec<_> = (0..).zip(&volume.levels).flat_map(|(level, _)| {
                 let chunks = VoxelBox::of_size(volume.chunks(level as usize));
@@ -189,8 +198,15 @@ proptest! {
             if changed {
                 caught_up(&fixture, &mut changes).await;
             }
+            let newest = fixture.archive.catalog().revision("v").await.unwrap();
+            while keeping.revision() < newest {
+                kept_changes.next().await.unwrap();
+            }
+            let thumbnails = keeping.statistics().thumbnail_bytes;
+            prop_assert!(thumbnails > 0, "the coarse levels are made of them");
             let (old, fresh) = (read_all(&source).await, read_all(&fixture.open().await).await);
             prop_assert!(old == fresh, "stale voxels");
+            prop_assert!(read_all(&keeping).await == fresh, "stale thumbnails");
             // What the disk has now is what will be.
             drop(source);
             options.disk_cache.take().unwrap().close().await;

@@ -1,0 +1,120 @@
+//! The coarsest level of a tile's pyramid, which is all that coarse levels of the volume show of it.
+//!
+//! A voxel that is larger than the pixels of a tile's coarsest level is a mean of samples of that level
+//! \[000 §5.2, "Strategy for coarse resolution levels"\]. There the paper keeps the whole coarsest level that is
+//! stitched, and halves it. Here what that level is stitched from is kept: 128 x 128 pixels of each tile
+//! that was seen. Coarse blocks are made of it whichever tile comes or moves, and no pyramid is opened
+//! twice for them, though the index alone of a large pyramid is twenty times as large as its thumbnail.
+//!
+//! A pyramid never changes, so neither does its thumbnail: there is nothing to be forgotten.
+
+use bytes::{Buf, BufMut, Bytes, BytesMut};
+use glam::UVec2;
+use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_VOXELS};
+use saccade_core::volume::Dtype;
+
+use super::tiles::Fetched;
+
+/// The one sub-tile of a pyramid's coarsest level, decoded.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Thumbnail {
+    size: UVec2,
+    min: u16,
+    max: u16,
+    /// Little-endian; none where all pixels have one value.
+    voxels: Bytes,
+}
+
+impl Thumbnail {
+    /// Of `size` pixels with values from `min` to `max`; `voxels` are those of a whole sub-tile, padding
+    /// included, and none where `min` is `max`: 0 if it is blank.
+    pub(super) fn new(size: UVec2, (min, max): (u16, u16), voxels: Bytes) -> Self {
+        Self {
+            size,
+            min,
+            max,
+            voxels,
+        }
+    }
+
+    pub(super) fn level(&self) -> PyramidLevel {
+        PyramidLevel {
+            width: self.size.x,
+            height: self.size.y,
+            sub_tiles: UVec2::ONE,
+        }
+    }
+
+    pub(super) fn is_blank(&self) -> bool {
+        self.max == 0
+    }
+
+    /// Bounds of its values; `None` if it is blank.
+    pub(super) fn range(&self) -> Option<(u16, u16)> {
+        (!self.is_blank()).then_some((self.min, self.max))
+    }
+
+    /// Its sub-tile, as far as it is wanted.
+    pub(super) fn fetched(&self, wanted: &[UVec2]) -> Vec<(UVec2, Fetched)> {
+        let there = wanted.iter().filter(|_| !self.is_blank());
+        let fetched = there.map(|at| match self.voxels.is_empty() {
+            true => (*at, Fetched::Constant(self.min)),
+            false => (*at, Fetched::Decoded(self.voxels.clone())),
+        });
+        fetched.collect()
+    }
+
+    /// Memory it takes \[bytes\].
+    pub(super) fn memory(&self) -> usize {
+        size_of::<Self>() + self.voxels.len()
+    }
+
+    /// For [`Self::from_bytes`].
+    pub(super) fn to_bytes(&self) -> Bytes {
+        let mut bytes = BytesMut::with_capacity(12 + self.voxels.len());
+        bytes.put_u32_le(self.size.x);
+        bytes.put_u32_le(self.size.y);
+        bytes.put_u16_le(self.min);
+        bytes.put_u16_le(self.max);
+        bytes.put_slice(&self.voxels);
+        bytes.freeze()
+    }
+
+    /// What bytes were made of; `None` if they were not made of a thumbnail of `dtype`.
+    pub(super) fn from_bytes(mut bytes: Bytes, dtype: Dtype) -> Option<Self> {
+        let size = UVec2::new(bytes.try_get_u32_le().ok()?, bytes.try_get_u32_le().ok()?);
+        let (min, max) = (bytes.try_get_u16_le().ok()?, bytes.try_get_u16_le().ok()?);
+        let voxels = if min == max {
+            0
+        } else {
+            SUB_TILE_VOXELS * dtype.bytes()
+        };
+        (bytes.len() == voxels).then(|| Self::new(size, (min, max), bytes))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_a_thumbnail_or_none() {
+        let size = UVec2::new(100, 70);
+        let voxels = |bytes: usize| Bytes::from(vec![7; SUB_TILE_VOXELS * bytes]);
+        for (thumbnail, dtype) in [
+            (Thumbnail::new(size, (3, 9), voxels(1)), Dtype::Uint8),
+            (Thumbnail::new(size, (3, 900), voxels(2)), Dtype::Uint16),
+            (Thumbnail::new(size, (177, 177), Bytes::new()), Dtype::Uint8),
+            (Thumbnail::new(size, (0, 0), Bytes::new()), Dtype::Uint16),
+        ] {
+            let bytes = thumbnail.to_bytes();
+            for cut in [0, 3, 11, bytes.len() - 1] {
+                let cut = bytes.slice(..cut);
+                assert_eq!(Thumbnail::from_bytes(cut, dtype), None);
+            }
+            assert_eq!(Thumbnail::from_bytes(bytes, dtype), Some(thumbnail));
+        }
+        let of_other_type = Thumbnail::new(size, (3, 9), voxels(1)).to_bytes();
+        assert_eq!(Thumbnail::from_bytes(of_other_type, Dtype::Uint16), None);
+    }
+}
