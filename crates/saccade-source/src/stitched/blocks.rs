@@ -145,8 +145,14 @@ impl Inner {
             key,
             number,
         };
+        // Whoever asks first is built first: tasks begin in another order than they are spawned in.
+        let mut turn = Box::pin(self.builds.clone().acquire_owned());
+        let come = (&mut turn).now_or_never();
         let task = Task(self.runtime.spawn(async move {
-            let permit = inner.builds.acquire().await;
+            let permit = match come {
+                Some(permit) => permit,
+                None => turn.await,
+            };
             let place = Place {
                 channel: key.channel,
                 level: key.level,
