@@ -10,11 +10,12 @@
 //!
 //! Folders of sections are cursors: one look asks at most [`WatchConfig::budget`] folders and files what
 //! they are, lists only folders that changed since they were last listed, and goes on where the last look
-//! stopped. Sixteen bytes are kept per file. A file counts as new when its folder changed and its length or
+//! stopped. Sixteen bytes are kept per file, and eight more for those that an earlier process told of, until
+//! they are met. A file counts as new when its folder changed and its length or
 //! time did, so a microscope that images a tile again writes it under a temporary name and renames it, or
 //! under another name. Files that go away are not deletions: disks are cleared.
 
-use std::collections::HashMap;
+use std::collections::{HashSet, VecDeque};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -22,14 +23,15 @@ use std::time::{Duration, SystemTime};
 
 use glam::{DVec2, UVec2};
 use saccade_archive::acquisition::{
-    AcquisitionError, AcquisitionInfo, ChannelRef, Cursor, Record, RecordReader, RecordWriter,
-    TileRecord,
+    AcquisitionError, AcquisitionInfo, ChannelRef, Cursor, Record, RecordReader, TileRecord,
 };
 use saccade_archive::image::read_size;
 use saccade_core::transform::SectionFromTile;
 
 use crate::Cancel;
+use list::List;
 
+mod list;
 mod pattern;
 mod scan;
 #[cfg(test)]
@@ -97,23 +99,47 @@ pub enum WatchError {
     },
 }
 
+impl WatchError {
+    /// Whether there is no room for the records: what passes when somebody makes some.
+    pub fn is_full(&self) -> bool {
+        use io::ErrorKind::{QuotaExceeded, StorageFull};
+        let full = |source: &io::Error| matches!(source.kind(), StorageFull | QuotaExceeded);
+        match self {
+            Self::Acquisition(AcquisitionError::Write { source, .. })
+            | Self::Write { source, .. } => full(source),
+            _ => false,
+        }
+    }
+}
+
 /// A folder that is being watched.
 pub struct Watch<F> {
     config: WatchConfig,
     scanner: Scanner<F>,
     folder: PathBuf,
     kept: PathBuf,
-    records: RecordWriter,
-    /// Files whose size could not be read yet, and since when.
-    unread: HashMap<String, (Found, SystemTime)>,
+    /// The list of records, while this process is the one that writes it.
+    list: Option<List>,
+    /// Records that could not be written yet.
+    untold: VecDeque<Record>,
+    /// Files whose size could not be read yet.
+    unread: VecDeque<Unread>,
+}
+
+/// A file that is not written as far as its size.
+struct Unread {
+    found: Found,
+    stamp: Option<Stamp>,
+    /// When it was seen to change last.
+    since: SystemTime,
 }
 
 /// Name of the link to the watched folder.
 const LINK: &str = "files";
 
-/// Pauses for which a file whose head cannot be read is kept, before ingest is told and waits or sets it
+/// Pauses for which a file whose head cannot be read may stay as it is, before ingest is told and sets it
 /// aside.
-const PATIENCE: u32 = 4;
+const PATIENCE: u32 = 120;
 
 impl<F: Folders> Watch<F> {
     /// Begins, or goes on, to watch `folder`; the records are kept in `kept`.
@@ -147,31 +173,50 @@ impl<F: Folders> Watch<F> {
             Err(_) => std::os::unix::fs::symlink(&folder, &link)
                 .map_err(|source| WatchError::Write { source, path: link })?,
         }
-        let mut scanner = Scanner::new(folders, &folder, config.pattern.clone());
-        let told = fs::metadata(kept.join(RecordReader::FILE)).and_then(|meta| meta.modified());
-        let mut reader = RecordReader::new(kept, Cursor::default());
-        loop {
-            let lines = reader.read(4096)?;
-            if lines.is_empty() {
-                break;
-            }
-            for line in lines {
-                if let Ok(Record::Tile(tile)) = line.record
-                    && let Some(file) = tile.file.strip_prefix(LINK)
-                    && let Ok(told) = told
-                {
-                    scanner.remember(file.trim_start_matches('/'), told);
-                }
-            }
-        }
-        Ok(Self {
+        let scanner = Scanner::new(folders, &folder, config.pattern.clone());
+        let mut watch = Self {
             config,
             scanner,
             folder,
             kept: kept.to_owned(),
-            records: RecordWriter::open(kept)?,
-            unread: HashMap::new(),
-        })
+            list: None,
+            untold: VecDeque::new(),
+            unread: VecDeque::new(),
+        };
+        watch.take_over()?;
+        Ok(watch)
+    }
+
+    /// Whether this process writes the records. If not, another does that watches the same folder, until it ends.
+    pub fn leads(&self) -> bool {
+        self.list.is_some()
+    }
+
+    /// Becomes the one that writes the records, if no other process is.
+    fn take_over(&mut self) -> Result<bool, WatchError> {
+        let Some(list) = List::open(&self.kept)? else {
+            return Ok(false);
+        };
+        let told = fs::metadata(self.kept.join(RecordReader::FILE));
+        if let Ok(told) = told.and_then(|meta| meta.modified()) {
+            let mut reader = RecordReader::new(&self.kept, Cursor::default());
+            self.scanner.told_until(told);
+            loop {
+                let lines = reader.read(4096)?;
+                if lines.is_empty() {
+                    break;
+                }
+                for line in lines {
+                    if let Ok(Record::Tile(tile)) = line.record
+                        && let Some(file) = tile.file.strip_prefix(LINK)
+                    {
+                        self.scanner.remember(file.trim_start_matches('/'));
+                    }
+                }
+            }
+        }
+        self.list = Some(list);
+        Ok(true)
     }
 
     /// Where the records are kept: what [`crate::ingest::run`] follows.
@@ -179,44 +224,75 @@ impl<F: Folders> Watch<F> {
         &self.kept
     }
 
-    /// One look; how many files were told of, and what to do next.
+    /// Writes what is to be told; how much it was. What cannot be written is kept.
+    fn tell(&mut self) -> Result<u64, WatchError> {
+        let mut told = 0;
+        if let Some(list) = &mut self.list {
+            while let Some(record) = self.untold.front() {
+                list.append(record)?;
+                self.untold.pop_front();
+                told += 1;
+            }
+            list.sync()?;
+        }
+        Ok(told)
+    }
+
+    /// One look; how many files were told of, and what to do next. While another process writes the records,
+    /// there is nothing to do.
     ///
     /// # Errors
     ///
-    /// [`WatchError`].
+    /// [`WatchError`]; what was found is not lost, and told by a later look.
     pub fn look(&mut self) -> Result<(u64, Next), WatchError> {
+        if !self.leads() && !self.take_over()? {
+            return Ok((0, Next::Rest));
+        }
+        // Nothing more is found before there is room for what was.
+        let before = self.tell()?;
         let seen = self.scanner.look(self.config.budget);
         let (found, mut next) = seen.map_err(|source| WatchError::Look {
             source,
             path: self.folder.clone(),
         })?;
-        let (mut told, now) = (0, self.scanner.now());
-        let again: Vec<_> = self.unread.drain().map(|(_, unread)| unread).collect();
-        let mut all: Vec<_> = found
-            .into_iter()
-            .map(|found| (found, now))
-            .chain(again)
-            .collect();
-        all.sort_by(|a, b| (&a.0.file, a.1).cmp(&(&b.0.file, b.1)));
-        all.dedup_by(|a, b| a.0.file == b.0.file);
+        let now = self.scanner.now();
+        if !self.unread.is_empty() {
+            let again: HashSet<&str> = found.iter().map(|found| &*found.file).collect();
+            self.unread
+                .retain(|unread| !again.contains(&*unread.found.file));
+        }
+        let new = found.into_iter().map(|found| Unread {
+            stamp: self.scanner.stamp(&found.file),
+            found,
+            since: now,
+        });
+        let new: Vec<_> = new.collect();
+        // However many there are, a look takes up so many of them.
+        let again = self.unread.len().min(self.config.budget);
+        let mut all: Vec<_> = self.unread.drain(..again).collect();
+        all.extend(new);
+        all.sort_by(|a, b| a.found.file.cmp(&b.found.file));
         let patience = self.config.poll * PATIENCE;
-        for (found, since) in all {
-            let size = match read_size(&self.folder.join(&found.file)) {
+        for mut unread in all {
+            let size = match read_size(&self.folder.join(&unread.found.file)) {
                 Ok([x, y]) => UVec2::new(x, y),
-                Err(_) if now.duration_since(since).unwrap_or_default() < patience => {
-                    self.unread.insert(found.file.clone(), (found, since));
-                    continue;
+                Err(_) => {
+                    let stamp = self.scanner.stamp(&unread.found.file);
+                    if stamp != unread.stamp {
+                        (unread.stamp, unread.since) = (stamp, now);
+                    }
+                    if now.duration_since(unread.since).unwrap_or_default() < patience {
+                        self.unread.push_back(unread);
+                        continue;
+                    }
+                    // Ingest finds out what is wrong, and says so.
+                    UVec2::ONE
                 }
-                // Ingest finds out what is wrong, and says so.
-                Err(_) => UVec2::ONE,
             };
-            self.records
-                .append(&Record::Tile(self.record(&found, size)))?;
-            told += 1;
+            let record = Record::Tile(self.record(&unread.found, size));
+            self.untold.push_back(record);
         }
-        if told > 0 {
-            self.records.sync()?;
-        }
+        let told = before + self.tell()?;
         if next == Next::Rest && !self.unread.is_empty() {
             next = Next::Again;
         }
@@ -252,7 +328,7 @@ impl<F: Folders> Watch<F> {
 ///
 /// # Errors
 ///
-/// [`WatchError`]: but a folder that cannot be listed for a while is tried again.
+/// [`WatchError`]: but a folder that cannot be listed for a while is tried again, and a full disk is waited out.
 pub fn run<F: Folders>(
     watch: &mut Watch<F>,
     once: bool,
@@ -278,6 +354,7 @@ pub fn run<F: Folders>(
                     path.display()
                 );
             }
+            Err(e) if e.is_full() => log::warn!("{e}; trying again"),
             Err(e) => return Err(e),
         }
         let mut left = watch.config.poll;

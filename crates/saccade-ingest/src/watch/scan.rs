@@ -1,6 +1,6 @@
 //! Which files are new, found with few questions to the file system.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
@@ -152,8 +152,10 @@ pub struct Scanner<F> {
     listing: Option<Listing>,
     /// What each file looked like, by the hash of its path.
     files: HashMap<u64, u64>,
-    /// Files told of before this process, at this time or earlier.
-    told: HashMap<u64, SystemTime>,
+    /// Files told of before this process, and not met yet by this one.
+    told: HashSet<u64>,
+    /// When the last of them was told of.
+    told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
 }
 
@@ -177,7 +179,8 @@ impl<F: Folders> Scanner<F> {
             paths: HashMap::from([(PathBuf::new(), 0)]),
             listing: None,
             files: HashMap::new(),
-            told: HashMap::new(),
+            told: HashSet::new(),
+            told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
         }
     }
@@ -187,9 +190,19 @@ impl<F: Folders> Scanner<F> {
         self.folders.now()
     }
 
-    /// Says that a file was told of by an earlier process, no later than `at`.
-    pub fn remember(&mut self, file: &str, at: SystemTime) {
-        self.told.insert(self.hasher.hash_one(file), at);
+    /// What a file looks like; `None` if it cannot be asked.
+    pub(super) fn stamp(&self, file: &str) -> Option<Stamp> {
+        self.folders.stamp(&self.root.join(file)).ok()
+    }
+
+    /// Says that a file was told of by an earlier process, no later than [`Self::told_until`] says.
+    pub fn remember(&mut self, file: &str) {
+        self.told.insert(self.hasher.hash_one(file));
+    }
+
+    /// Says when earlier processes told of the last file.
+    pub fn told_until(&mut self, at: SystemTime) {
+        self.told_until = at;
     }
 
     /// Goes on with the round of the folders, to its end or with at most `budget` questions; what was found, and what to do next.
@@ -304,8 +317,8 @@ impl<F: Folders> Scanner<F> {
         let told = self.told.remove(&key);
         let same = match (before, told) {
             (Some(before), _) => before == seen,
-            (None, Some(told)) => stamp.modified <= told,
-            (None, None) => false,
+            (None, true) => stamp.modified <= self.told_until,
+            (None, false) => false,
         };
         if !same {
             found.push(Found { file, place });

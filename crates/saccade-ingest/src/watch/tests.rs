@@ -141,6 +141,135 @@ impl Folders for Counted {
     }
 }
 
+/// Sections of many tiles that were there for ever, listed out of thin air; of the first, one more file from a
+/// certain time on.
+#[derive(Clone)]
+struct Vast {
+    sections: usize,
+    tiles: usize,
+    asked: Rc<Cell<usize>>,
+    entries: Arc<std::sync::atomic::AtomicUsize>,
+    grown: Rc<Cell<bool>>,
+}
+
+impl Vast {
+    fn take(&self) -> usize {
+        self.asked.take() + self.entries.swap(0, std::sync::atomic::Ordering::Relaxed)
+    }
+}
+
+impl Folders for Vast {
+    fn modified(&self, folder: &Path) -> io::Result<SystemTime> {
+        self.asked.set(self.asked.get() + 1);
+        let grown = self.grown.get() && folder.ends_with("s0");
+        Ok(Counted::at(if grown { 200 } else { 100 }))
+    }
+
+    fn list(
+        &self,
+        folder: &Path,
+    ) -> io::Result<Box<dyn Iterator<Item = io::Result<Entry>> + Send>> {
+        self.asked.set(self.asked.get() + 1);
+        let root = folder == Path::new("/r");
+        let more = usize::from(self.grown.get() && folder.ends_with("s0"));
+        let count = if root {
+            self.sections
+        } else {
+            self.tiles + more
+        };
+        let entries = Arc::clone(&self.entries);
+        Ok(Box::new((0..count).map(move |n| {
+            entries.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            let name = if root {
+                format!("s{n}")
+            } else {
+                format!("r{n}_c0.tif")
+            };
+            Ok(Entry { name, folder: root })
+        })))
+    }
+
+    fn stamp(&self, _: &Path) -> io::Result<Stamp> {
+        self.asked.set(self.asked.get() + 1);
+        let modified = Counted::at(1);
+        Ok(Stamp { bytes: 9, modified })
+    }
+
+    fn now(&self) -> SystemTime {
+        Counted::at(1_000_000)
+    }
+}
+
+/// Resident memory of this process \[bytes\].
+fn resident() -> u64 {
+    let statm = fs::read_to_string("/proc/self/statm").unwrap();
+    let pages: u64 = statm.split(' ').nth(1).unwrap().parse().unwrap();
+    pages * 4096
+}
+
+/// 200,000 files, or as many as `SACCADE_TEST_FILES` says: no look asks more than its budget, however many
+/// there are, also where an earlier process told of all of them; and what came is found by listing its folder
+/// alone.
+#[test]
+fn work_per_look_does_not_grow_with_the_archive() {
+    let files = std::env::var("SACCADE_TEST_FILES").map(|n| n.parse().unwrap());
+    let (tiles, budget) = (500, WatchConfig::BUDGET);
+    let sections = files.unwrap_or(200_000_usize).div_ceil(tiles);
+    let disk = Vast {
+        sections,
+        tiles,
+        asked: Rc::default(),
+        entries: Arc::default(),
+        grown: Rc::default(),
+    };
+    let pattern = pattern("s{section}/r{row}_c{column}.tif");
+    let before = resident();
+    let begin = std::time::Instant::now();
+    for known in [false, true] {
+        disk.grown.set(false);
+        let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern.clone());
+        if known {
+            scanner.told_until(Counted::at(50));
+            for n in 0..sections * tiles {
+                scanner.remember(&format!("s{}/r{}_c0.tif", n / tiles, n % tiles));
+            }
+        }
+        let (mut found, mut looks, mut longest) = (0, 0, Duration::ZERO);
+        loop {
+            let look = std::time::Instant::now();
+            let (new, next) = scanner.look(budget).unwrap();
+            longest = longest.max(look.elapsed());
+            let asked = disk.take();
+            assert!(asked <= budget + 2, "{asked} questions");
+            found += new.len();
+            looks += 1;
+            if next == Next::Rest {
+                break;
+            }
+        }
+        assert_eq!(found, if known { 0 } else { sections * tiles });
+        assert!(looks >= 2 * sections * tiles / budget, "{looks} looks");
+        // A file comes: it is found within one round, which asks each folder once, and lists one.
+        disk.grown.set(true);
+        let (mut new, mut asked) = (Vec::new(), 0);
+        for _ in 0..sections / budget + 2 {
+            new.extend(scanner.look(budget).unwrap().0);
+            let now = disk.take();
+            assert!(now <= budget + 2, "{now} questions");
+            asked += now;
+        }
+        assert_eq!(new.len(), 1);
+        assert_eq!(new[0].file, format!("s0/r{tiles}_c0.tif"));
+        assert!(asked <= 2 * (sections + 2 * budget), "{asked} questions");
+        println!(
+            "{} files, told of before: {known}: {looks} looks, the longest {longest:?}; {:?} so far, {} MB",
+            sections * tiles,
+            begin.elapsed(),
+            (resident() - before) >> 20
+        );
+    }
+}
+
 /// However much there is, a look asks so many questions; and once all is known, only folders are asked.
 #[test]
 fn a_look_at_a_large_archive_is_a_bounded_number_of_questions() {
@@ -316,11 +445,113 @@ fn a_file_without_its_head_is_looked_at_again() {
     image(&path, 32, 1);
     looks(&mut watch);
     assert_eq!(told(&kept)[0].size, UVec2::splat(32));
-    // What never becomes an image is told as well: ingest says what is wrong with it.
-    fs::write(scope.join("s1/r1_c2_a.tif"), b"GIF89a, not a TIFF").unwrap();
-    for _ in 0..5 {
+    // What never becomes an image is told as well: ingest says what is wrong with it. But not while it grows.
+    let other = scope.join("s1/r1_c2_a.tif");
+    fs::write(&other, b"GIF89a, not a TIFF").unwrap();
+    watch.config.poll = Duration::from_millis(2);
+    for n in 0..10 {
         looks(&mut watch);
-        std::thread::sleep(Duration::from_millis(600));
+        std::thread::sleep(Duration::from_millis(60));
+        fs::write(&other, vec![b'G'; n + 20]).unwrap();
     }
+    assert_eq!(told(&kept).len(), 1, "it has not rested for long enough");
+    looks(&mut watch);
+    std::thread::sleep(Duration::from_millis(300));
+    looks(&mut watch);
     assert!(told(&kept).iter().any(|t| t.tile == "s1_r1_c2_a"));
+}
+
+/// A list that takes so many records, and no more until there is room.
+struct Full {
+    to: saccade_archive::acquisition::RecordWriter,
+    room: Arc<std::sync::atomic::AtomicUsize>,
+}
+
+impl list::Append for Full {
+    fn append(&mut self, record: &Record) -> Result<(), AcquisitionError> {
+        use std::sync::atomic::Ordering::SeqCst;
+        let took = |room: usize| room.checked_sub(1);
+        if self.room.fetch_update(SeqCst, SeqCst, took).is_err() {
+            return Err(AcquisitionError::Write {
+                source: io::ErrorKind::StorageFull.into(),
+                path: "list".into(),
+            });
+        }
+        self.to.append(record)
+    }
+
+    fn sync(&self) -> Result<(), AcquisitionError> {
+        self.to.sync()
+    }
+}
+
+/// What cannot be written is kept, and nothing more is looked for; then it is told, once.
+#[test]
+fn a_list_that_cannot_grow_is_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    for column in 1..10 {
+        image(&scope.join(format!("s3/r2_c{column}_b.tif")), 16, 9);
+    }
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    let room = Arc::new(std::sync::atomic::AtomicUsize::new(2));
+    let to = saccade_archive::acquisition::RecordWriter::open(&kept).unwrap();
+    let full = Full {
+        to,
+        room: room.clone(),
+    };
+    watch.list.as_mut().unwrap().replace(Box::new(full));
+    let mut failed = 0;
+    while failed < 5 {
+        match watch.look() {
+            Ok(_) => {}
+            Err(e) => {
+                assert!(e.is_full(), "{e}");
+                failed += 1;
+            }
+        }
+    }
+    assert_eq!(told(&kept).len(), 2);
+    assert!(watch.untold.len() <= config().budget, "it went on");
+    let cancel = Cancel::new();
+    std::thread::scope(|s| {
+        s.spawn(|| {
+            std::thread::sleep(Duration::from_millis(50));
+            room.store(100, std::sync::atomic::Ordering::SeqCst);
+        });
+        run(&mut watch, true, &cancel).unwrap();
+    });
+    let mut names: Vec<_> = told(&kept).into_iter().map(|t| t.tile).collect();
+    names.sort();
+    let want: Vec<_> = (1..10).map(|c| format!("s3_r2_c{c}_b")).collect();
+    assert_eq!(names, want);
+}
+
+/// Of two that watch the same folder one writes; when it ends, the other goes on where it was.
+#[test]
+fn one_of_two_watchers_writes() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    image(&scope.join("s1/r1_c1_a.tif"), 16, 1);
+    let mut first = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    let mut second = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    assert_eq!((first.leads(), second.leads()), (true, false));
+    looks(&mut second);
+    assert_eq!(told(&kept), []);
+    looks(&mut first);
+    image(&scope.join("s1/r1_c2_a.tif"), 16, 2);
+    looks(&mut second);
+    assert_eq!(told(&kept).len(), 1);
+    // It ends in the middle of a line.
+    drop(first);
+    let mut list = fs::OpenOptions::new();
+    let mut list = list
+        .append(true)
+        .open(kept.join(RecordReader::FILE))
+        .unwrap();
+    io::Write::write_all(&mut list, b"{\"record\":\"ti").unwrap();
+    looks(&mut second);
+    assert!(second.leads());
+    let names: Vec<_> = told(&kept).into_iter().map(|t| t.tile).collect();
+    assert_eq!(names, ["s1_r1_c1_a", "s1_r1_c2_a"]);
 }

@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
 
+mod bare;
 mod crashes;
 mod faults;
 mod kill;
