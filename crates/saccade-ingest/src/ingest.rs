@@ -21,6 +21,7 @@ mod enter;
 mod error;
 mod options;
 mod prepare;
+mod process;
 mod run;
 mod waiting;
 

@@ -364,7 +364,7 @@ impl<'c> Commit<'c> {
         let keep = "INSERT INTO waiting (volume, position, tile, record, reason, parked) \
                     VALUES ($1, $2, $3, $4, $5, $6) ON CONFLICT (volume, position) DO UPDATE SET \
                     tile = excluded.tile, record = excluded.record, reason = excluded.reason, \
-                    parked = excluded.parked, attempts = 0";
+                    parked = excluded.parked, attempts = 0, begun = 0";
         let values = [
             self.volume.into(),
             waiting.position.into(),

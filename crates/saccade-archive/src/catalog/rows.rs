@@ -145,7 +145,7 @@ pub(super) fn claim(row: &Row) -> Result<Claim, Error> {
     let parked: i64 = row.get("parked")?;
     Ok(Claim {
         waiting: waiting(row)?,
-        attempts: small(row, "attempts")?,
+        deaths: small(row, "attempts")?,
         parked: parked != 0,
     })
 }

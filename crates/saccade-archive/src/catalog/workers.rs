@@ -10,6 +10,7 @@ use super::{Catalog, CatalogError, Waiting, rows};
 pub struct Worker {
     pub(super) id: i64,
     name: String,
+    process: String,
     lease: Duration,
 }
 
@@ -30,9 +31,9 @@ impl Worker {
 pub struct Claim {
     /// The record.
     pub waiting: Waiting,
-    /// How often it was claimed since it was last known not to harm who works on it, this time
-    /// included. One that ends its workers is claimed again and again.
-    pub attempts: u32,
+    /// Workers that ended while they worked on it, since it was last known not to harm who does. What only
+    /// waited in a dead worker's claim did not end it.
+    pub deaths: u32,
     /// Whether its file was not whole when it was looked at last.
     pub parked: bool,
 }
@@ -48,6 +49,21 @@ impl Catalog {
     ///
     /// [`CatalogError::ReadOnly`], or what the database says.
     pub async fn register(&self, name: &str, lease: Duration) -> Result<Worker, CatalogError> {
+        self.register_process(name, "", lease).await
+    }
+
+    /// The same of a worker whose `process` can be told from all others, on this machine and elsewhere, so that
+    /// who finds it dead can say so: see [`Self::processes`].
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn register_process(
+        &self,
+        name: &str,
+        process: &str,
+        lease: Duration,
+    ) -> Result<Worker, CatalogError> {
         let mut transaction = self.transaction(Durability::Soon).await?;
         let now = self.now(&mut transaction).await?;
         // Those that have been gone for a day are forgotten.
@@ -56,17 +72,69 @@ impl Catalog {
         let forget = "DELETE FROM workers WHERE lease < $1";
         let forgotten = transaction.run(forget, &[ago.into()]).await;
         forgotten.map_err(|e| self.failed(e))?;
-        let insert = "INSERT INTO workers (name, lease) VALUES ($1, $2) RETURNING id";
+        let insert = "INSERT INTO workers (name, process, lease) VALUES ($1, $2, $3) RETURNING id";
         let until = rows::millis(now + lease);
-        let row = transaction.one(insert, &[name.into(), until.into()]).await;
+        let values = [name.into(), process.into(), until.into()];
+        let row = transaction.one(insert, &values).await;
         let id = row.and_then(|row| row.ok_or(sqlx::Error::RowNotFound)?.get("id"));
         let id = id.map_err(|e| self.failed(e))?;
         transaction.commit().await.map_err(|e| self.failed(e))?;
         Ok(Worker {
             id,
             name: name.to_owned(),
+            process: process.to_owned(),
             lease,
         })
+    }
+
+    /// The processes of workers whose leases are not over, as far as they are known.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn processes(&self) -> Result<Vec<String>, CatalogError> {
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        let now = rows::millis(self.now(&mut transaction).await?);
+        let question = "SELECT DISTINCT process FROM workers WHERE process <> '' AND lease >= $1";
+        let rows = transaction.all(question, &[now.into()]).await;
+        let processes = rows.and_then(|rows| rows.iter().map(|row| row.get("process")).collect());
+        processes.map_err(|e| self.failed(e))
+    }
+
+    /// Ends the leases of a process's workers: it is dead, and what it has claimed is free. Who only looked
+    /// dead finds its claims with others.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn bury(&self, process: &str) -> Result<(), CatalogError> {
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        let bury = "UPDATE workers SET lease = 0 WHERE process = $1";
+        let buried = transaction.run(bury, &[process.into()]).await;
+        buried.map_err(|e| self.failed(e))?;
+        transaction.commit().await.map_err(|e| self.failed(e))
+    }
+
+    /// Notes that a worker begins to work on a record that it has claimed: should it end meanwhile, that
+    /// counts as one of [`Claim::deaths`].
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn begin_record(
+        &self,
+        volume: &str,
+        worker: &Worker,
+        position: u64,
+    ) -> Result<(), CatalogError> {
+        let volume = self.volume_id(volume).await?;
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        let begin = "UPDATE waiting SET begun = 1 \
+                     WHERE volume = $1 AND position = $2 AND worker = $3";
+        let values = [volume.into(), position.into(), worker.id.into()];
+        let begun = transaction.run(begin, &values).await;
+        begun.map_err(|e| self.failed(e))?;
+        transaction.commit().await.map_err(|e| self.failed(e))
     }
 
     /// A sign of life.
@@ -115,7 +183,8 @@ impl Catalog {
                          AND NOT EXISTS (SELECT 1 FROM waiting o WHERE o.volume = w.volume \
                            AND o.tile = w.tile AND o.position < w.position AND o.parked = 0) \
                        ORDER BY w.position LIMIT $4) \
-                     UPDATE waiting SET worker = $2, attempts = attempts + 1 \
+                     UPDATE waiting SET worker = $2, \
+                       attempts = attempts + begun, begun = 0 \
                      WHERE volume = $1 AND position IN (SELECT position FROM free) \
                      RETURNING position, record, reason, attempts, parked",
             // A record that is being given back or done right now is passed over rather than waited for.
@@ -125,7 +194,8 @@ impl Catalog {
                            AND NOT EXISTS (SELECT 1 FROM waiting o WHERE o.volume = w.volume \
                              AND o.tile = w.tile AND o.position < w.position AND o.parked = 0) \
                          ORDER BY w.position LIMIT $4 FOR UPDATE OF w SKIP LOCKED) \
-                       UPDATE waiting SET worker = $2, attempts = attempts + 1 \
+                       UPDATE waiting SET worker = $2, \
+                       attempts = attempts + begun, begun = 0 \
                        WHERE volume = $1 AND position IN (SELECT position FROM free) \
                        RETURNING position, record, reason, attempts, parked",
         };
@@ -151,9 +221,7 @@ impl Catalog {
     pub async fn release(&self, worker: &Worker) -> Result<(), CatalogError> {
         let mut transaction = self.transaction(Durability::Soon).await?;
         for release in [
-            "UPDATE waiting SET worker = NULL, attempts = attempts - 1 \
-             WHERE worker = $1 AND attempts > 0",
-            "UPDATE waiting SET worker = NULL WHERE worker = $1",
+            "UPDATE waiting SET worker = NULL, begun = 0 WHERE worker = $1",
             "DELETE FROM workers WHERE id = $1",
         ] {
             let done = transaction.run(release, &[worker.id.into()]).await;
@@ -187,10 +255,11 @@ impl Catalog {
         worker: &Worker,
     ) -> Result<SystemTime, CatalogError> {
         let now = self.now(transaction).await?;
-        let renew = "INSERT INTO workers (id, name, lease) VALUES ($1, $2, $3) \
+        let renew = "INSERT INTO workers (id, name, process, lease) VALUES ($1, $2, $3, $4) \
                      ON CONFLICT (id) DO UPDATE SET lease = excluded.lease";
         let until = rows::millis(now + worker.lease).into();
-        let values = [worker.id.into(), (&worker.name).into(), until];
+        let (name, process) = (&worker.name, &worker.process);
+        let values = [worker.id.into(), name.into(), process.into(), until];
         let renewed = transaction.run(renew, &values).await;
         renewed.map_err(|e| self.failed(e))?;
         Ok(now)

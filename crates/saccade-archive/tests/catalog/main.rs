@@ -53,6 +53,7 @@ on_both! {
     workers::a_sign_of_life_keeps_claims,
     workers::records_of_a_tile_are_worked_on_in_order,
     workers::who_leaves_gives_back,
+    workers::what_the_dead_had_is_free_at_once,
     workers::records_are_read_once,
     workers::old_changes_are_forgotten_and_said_to_be,
     workers::workers_that_die_lose_nothing,

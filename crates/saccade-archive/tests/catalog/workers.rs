@@ -67,7 +67,7 @@ pub(crate) async fn workers_share_what_is_to_be_done(place: &Place) {
                 && !claims.is_empty()
             {
                 assert!(claims.len() <= 3);
-                assert!(claims.iter().all(|c| (c.attempts, c.parked) == (1, false)));
+                assert!(claims.iter().all(|c| (c.deaths, c.parked) == (0, false)));
                 mine.extend(claims.into_iter().map(|c| c.waiting));
             }
             catalog.close().await;
@@ -91,6 +91,8 @@ pub(crate) async fn a_dead_workers_claims_return(place: &Place) {
     let dead = catalog.register("dead", LEASE).await.unwrap();
     let heir = catalog.register("heir", LEASE).await.unwrap();
     assert_eq!(catalog.claim("v", &dead, 2).await.unwrap().len(), 2);
+    // It dies with one in hand; the other waited.
+    catalog.begin_record("v", &dead, 1).await.unwrap();
     clock.turn(LEASE);
     // To the last moment they are the other one's.
     let left = catalog.claim("v", &heir, 9).await.unwrap();
@@ -100,9 +102,14 @@ pub(crate) async fn a_dead_workers_claims_return(place: &Place) {
     let inherited = catalog.claim("v", &heir, 9).await.unwrap();
     let seen: Vec<_> = inherited
         .iter()
-        .map(|c| (c.waiting.position, c.attempts))
+        .map(|c| (c.waiting.position, c.deaths))
         .collect();
-    assert_eq!(seen, [(0, 2), (1, 2)]);
+    assert_eq!(seen, [(0, 0), (1, 1)]);
+    // What is another's is not begun.
+    catalog.begin_record("v", &dead, 0).await.unwrap();
+    for position in [0, 1] {
+        catalog.begin_record("v", &heir, position).await.unwrap();
+    }
     // Who comes back from the dead has nothing to say any more, and gets nothing back.
     let mut commit = catalog.begin("v").await.unwrap();
     assert!(!commit.holds(&dead, 0).await.unwrap());
@@ -118,9 +125,9 @@ pub(crate) async fn a_dead_workers_claims_return(place: &Place) {
     let again = catalog.claim("v", &dead, 9).await.unwrap();
     let seen: Vec<_> = again
         .iter()
-        .map(|c| (c.waiting.position, c.attempts, c.parked))
+        .map(|c| (c.waiting.position, c.deaths, c.parked))
         .collect();
-    assert_eq!(seen, [(0, 1, true), (1, 3, false), (2, 2, false)]);
+    assert_eq!(seen, [(0, 0, true), (1, 2, false), (2, 0, false)]);
 }
 
 pub(crate) async fn a_sign_of_life_keeps_claims(place: &Place) {
@@ -171,13 +178,44 @@ pub(crate) async fn who_leaves_gives_back(place: &Place) {
     let staying = catalog.register("staying", LEASE).await.unwrap();
     assert_eq!(catalog.claim("v", &staying, 1).await.unwrap().len(), 1);
     assert_eq!(catalog.claim("v", &leaving, 9).await.unwrap().len(), 2);
+    catalog.begin_record("v", &leaving, 2).await.unwrap();
     catalog.release(&leaving).await.unwrap();
     let claims = catalog.claim("v", &staying, 9).await.unwrap();
     let seen: Vec<_> = claims
         .iter()
-        .map(|c| (c.waiting.position, c.attempts))
+        .map(|c| (c.waiting.position, c.deaths))
         .collect();
-    assert_eq!(seen, [(1, 1), (2, 1)]);
+    assert_eq!(seen, [(1, 0), (2, 0)]);
+}
+
+pub(crate) async fn what_the_dead_had_is_free_at_once(place: &Place) {
+    let (catalog, clock) = timed(place).await;
+    enqueue(&catalog, (0..4).map(record)).await;
+    let nameless = catalog.register("nameless", LEASE).await.unwrap();
+    let register = async |process| catalog.register_process("w", process, LEASE).await.unwrap();
+    let (dead, alive) = (register("a").await, register("b").await);
+    assert_eq!(catalog.claim("v", &dead, 2).await.unwrap().len(), 2);
+    assert_eq!(catalog.claim("v", &nameless, 1).await.unwrap().len(), 1);
+    catalog.begin_record("v", &dead, 0).await.unwrap();
+    let mut processes = catalog.processes().await.unwrap();
+    processes.sort();
+    assert_eq!(processes, ["a", "b"]);
+    assert_eq!(catalog.claim("v", &alive, 1).await.unwrap().len(), 1);
+    catalog.bury("a").await.unwrap();
+    assert_eq!(catalog.processes().await.unwrap(), ["b"]);
+    let claims = catalog.claim("v", &alive, 9).await.unwrap();
+    let seen: Vec<_> = { claims.iter() }
+        .map(|c| (c.waiting.position, c.deaths))
+        .collect();
+    assert_eq!(seen, [(0, 1), (1, 0)], "what others have is theirs");
+    // It was not dead: it gets what is free, and nothing back.
+    catalog.keep_alive(&dead).await.unwrap();
+    assert_eq!(catalog.processes().await.unwrap().len(), 2);
+    let mut commit = catalog.begin("v").await.unwrap();
+    assert!(!commit.holds(&dead, 0).await.unwrap());
+    drop(commit);
+    clock.turn(LEASE * 2);
+    assert!(catalog.processes().await.unwrap().is_empty());
 }
 
 pub(crate) async fn records_are_read_once(place: &Place) {

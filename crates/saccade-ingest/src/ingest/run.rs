@@ -20,7 +20,7 @@ use tokio::sync::mpsc;
 use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, retry};
 use super::prepare::{Backoff, Context, Outcome, Stored, quarantine};
 use super::waiting::{Due, WaitingRoom};
-use super::{IngestError, IngestOptions};
+use super::{IngestError, IngestOptions, process};
 use crate::cancel::Cancel;
 use crate::progress::{Meter, Progress, State};
 
@@ -30,9 +30,9 @@ const DELETE_AT_ONCE: u32 = 64;
 /// Attempts at reading the records when all that is there is to be done once.
 const ATTEMPTS_ONCE: u32 = 4;
 
-/// Attempts at a record after which it is worked on alone, so that if it ends its worker, no other
-/// comes under suspicion.
-const SUSPECT: u32 = 3;
+/// Workers that ended with a record in hand, after which it is worked on alone, so that if it ends another, no
+/// other comes under suspicion.
+const SUSPECT: u32 = 2;
 
 /// What was done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -82,13 +82,15 @@ pub async fn run(
         None => check_name(&volume.name).map_err(impossible)?,
     }
     let catalog = archive.catalog();
-    catalog.create_volume(&volume).await?;
+    retry(options, progress, || catalog.create_volume(&volume)).await?;
     let (stored, why) = Stored::new(volume.dtype, info.kind, options.encoding);
     if let Some(why) = why {
         progress.notice(why);
     }
-    let worker = catalog.register(&worker_name(), options.lease).await?;
-    let cursor = catalog.cursor(&volume.name).await?;
+    let (name, process) = (worker_name(), process::this().unwrap_or_default());
+    let register = || catalog.register_process(&name, &process, options.lease);
+    let worker = retry(options, progress, register).await?;
+    let cursor = retry(options, progress, || catalog.cursor(&volume.name)).await?;
     let mut ingest = Ingest {
         archive,
         options,
@@ -186,6 +188,9 @@ impl Ingest<'_> {
                 &self.room,
                 &self.left,
             ));
+            if worked == 0 && queued + waiting > 0 {
+                self.bury_the_dead().await?;
+            }
             // Others may still be at work; should they die, it is this one's turn.
             if worked == 0 && self.options.once && queued + waiting == 0 {
                 return Ok(());
@@ -238,6 +243,18 @@ impl Ingest<'_> {
         self.summary.deleted += read.deleted;
         self.summary.quarantined += read.quarantined;
         Ok(worked)
+    }
+
+    /// Frees what workers have claimed that were killed on this machine. The leases of others are waited for.
+    async fn bury_the_dead(&self) -> Result<(), IngestError> {
+        let catalog = self.archive.catalog();
+        let (options, progress) = (self.options, self.context.progress);
+        let processes = retry(options, progress, || catalog.processes()).await?;
+        for process in processes.iter().filter(|process| process::is_gone(process)) {
+            retry(options, progress, || catalog.bury(process)).await?;
+            log::info!("a worker has ended without leave, its records are free: {process}");
+        }
+        Ok(())
     }
 
     async fn count(&self) -> Result<(u64, u64), IngestError> {
@@ -323,6 +340,12 @@ impl Supply<'_> {
         }
         let job = self.queue.pop_front();
         self.worked += usize::from(job.is_some());
+        if let Some(Job { position, .. }) = job {
+            // Should it end this worker, it is known to have been in hand.
+            let (catalog, volume) = (self.archive.catalog(), self.context.volume);
+            let begin = || catalog.begin_record(volume, self.worker, position);
+            retry(self.options, self.context.progress, begin).await?;
+        }
         Ok(job)
     }
 
@@ -337,9 +360,9 @@ impl Supply<'_> {
         let claims = retry(options, progress, claim).await?;
         let claimed = claims.len();
         for claim in claims {
-            let attempts = claim.attempts;
+            let deaths = claim.deaths;
             let job = Job::claimed(claim, options);
-            if attempts >= SUSPECT {
+            if deaths >= SUSPECT {
                 self.suspects.push(job);
             } else {
                 self.queue.push_back(job);
@@ -526,14 +549,13 @@ impl Job {
             waiting: Waiting {
                 position, record, ..
             },
-            attempts,
+            deaths,
             ..
         } = claim;
-        let work = if attempts > options.attempts {
+        let work = if deaths >= options.attempts {
             let reason = format!(
-                "{} workers ended while they worked on it; look at the image, and append its record \
-                 again",
-                attempts - 1
+                "{deaths} workers ended while they worked on it; look at the image, and append its \
+                 record again"
             );
             Work::Done(quarantine(&record, reason, None, None))
         } else {
