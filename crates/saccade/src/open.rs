@@ -1,11 +1,13 @@
 //! Volumes that the command line names: of a server, of an archive, or an image that somebody else wrote.
 
+use std::error::Error;
 use std::path::Path;
 use std::str::FromStr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
-use saccade_archive::{StorageLocation, VisualizationArchive};
+use saccade_archive::{ArchiveError, StorageLocation, VisualizationArchive};
 use saccade_serve::{CatalogStatus, StatusSource};
 use saccade_source::objects::Location;
 use saccade_source::remote::{Quarantined, RemoteError, RemoteSource, Status, volumes};
@@ -17,6 +19,38 @@ use saccade_view::AcquisitionReader;
 use crate::arguments::CatalogArgument;
 use crate::report::say;
 use crate::stitching::Stitching;
+
+/// Between attempts to open an archive whose catalog's server is away.
+const TRY_AGAIN: Duration = Duration::from_secs(1);
+
+/// Opens an archive for work that goes on for months. While the server of its catalog is away, waits for it, and
+/// says so.
+pub(crate) async fn waited_for<F>(mut open: impl FnMut() -> F) -> Result<VisualizationArchive>
+where
+    F: Future<Output = Result<VisualizationArchive, ArchiveError>>,
+{
+    let mut waits = false;
+    loop {
+        match open().await {
+            Err(ArchiveError::Catalog(error)) if error.is_outage() => {
+                if !waits {
+                    let reason = error.source().map_or(String::new(), |e| format!(" ({e})"));
+                    say(&format!(
+                        "{error}{reason}; trying again until it can be used"
+                    ));
+                }
+                waits = true;
+                tokio::time::sleep(TRY_AGAIN).await;
+            }
+            opened => {
+                if waits && opened.is_ok() {
+                    say("the catalog can be used now");
+                }
+                return Ok(opened?);
+            }
+        }
+    }
+}
 
 /// Where a volume is.
 #[derive(Clone, Debug)]

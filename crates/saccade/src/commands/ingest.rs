@@ -14,6 +14,7 @@ use saccade_ingest::watch::{self, Disk, Pattern, Watch, WatchConfig};
 
 use crate::arguments::{Archive, extent, pitch, scale, volume_name, voxel_nm};
 use crate::interrupt::cancel_when_interrupted;
+use crate::open::waited_for;
 use crate::progress::Shown;
 use crate::report::say;
 
@@ -189,7 +190,12 @@ impl Ingest {
         if let Some(folder) = location.folder() {
             refuse_same_folder(&self.acquisition, folder)?;
         }
-        let archive = VisualizationArchive::create(&location).await?;
+        let cancel = cancel_when_interrupted();
+        let opened = waited_for(|| VisualizationArchive::create(&location));
+        let archive = tokio::select! {
+            archive = opened => archive?,
+            () = cancel.cancelled() => return Ok(()),
+        };
         let options = IngestOptions {
             volume: self.volume,
             encoding: self.stored.encoding(),
@@ -199,7 +205,6 @@ impl Ingest {
                 .map_or(IngestOptions::DEFAULT.workers, usize::from),
             ..IngestOptions::DEFAULT
         };
-        let cancel = cancel_when_interrupted();
         let mut acquisition = self.acquisition.clone();
         let mut watching = None;
         if let Some(config) = bare {
@@ -213,6 +218,11 @@ impl Ingest {
             };
             let kept = beside.join(&name);
             let mut watch = Watch::open(config, Disk, &self.acquisition, &kept)?;
+            if !watch.leads() {
+                say(
+                    "another process watches this folder; what it finds is shared, and should it end, this one goes on",
+                );
+            }
             acquisition = kept;
             if self.once {
                 watch::run(&mut watch, true, &cancel)?;

@@ -10,7 +10,7 @@ use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, o
 
 use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
-use crate::open::Place;
+use crate::open::{Place, waited_for};
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
 
@@ -92,7 +92,11 @@ impl Serve {
         }
         let storage = self.place.storage().context("there is no archive")?;
         let location = self.catalog.location(storage.clone())?;
-        let archive = VisualizationArchive::open(&location).await?;
+        let opened = waited_for(|| VisualizationArchive::open(&location));
+        let archive = tokio::select! {
+            archive = opened => archive?,
+            () = interrupted() => return Ok(()),
+        };
         let server = Server::bind(self.at.address()).await?;
         let volumes = Volumes::new();
         let options = self.stitching.options().await;

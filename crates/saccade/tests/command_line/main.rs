@@ -5,6 +5,9 @@
 mod demo;
 mod errors;
 mod images;
+#[path = "../../../saccade-archive/tests/support/postgres.rs"]
+mod postgres;
+mod server_away;
 mod whole_way;
 
 use std::ffi::OsStr;

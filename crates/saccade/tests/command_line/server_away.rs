@@ -1,0 +1,141 @@
+//! The catalog's server is away: when the program starts, and while it works.
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::{Duration, Instant};
+
+use super::postgres::Server;
+use super::{Running, saccade, simulate};
+
+/// Longest wait for what must come.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// What a program writes, line by line.
+fn lines(from: impl std::io::Read + Send + 'static) -> Receiver<String> {
+    let (send, lines) = channel();
+    std::thread::spawn(move || {
+        for line in BufReader::new(from).lines().map_while(Result::ok) {
+            if send.send(line).is_err() {
+                return;
+            }
+        }
+    });
+    lines
+}
+
+/// Waits for a line that holds this.
+fn says(lines: &Receiver<String>, what: &str) -> String {
+    let until = Instant::now() + PATIENCE;
+    let mut before = Vec::new();
+    while let Ok(line) = lines.recv_timeout(until.saturating_duration_since(Instant::now())) {
+        if line.contains(what) {
+            return line;
+        }
+        before.push(line);
+    }
+    panic!("it does not say {what:?}, but {before:#?}");
+}
+
+struct Program {
+    running: Running,
+    stdout: Receiver<String>,
+    stderr: Receiver<String>,
+}
+
+impl Program {
+    fn start(arguments: &[&str]) -> Self {
+        let mut command = saccade();
+        command.args(arguments);
+        let mut child: Child = { command.stdout(Stdio::piped()).stderr(Stdio::piped()) }
+            .spawn()
+            .unwrap();
+        Self {
+            stdout: lines(child.stdout.take().unwrap()),
+            stderr: lines(child.stderr.take().unwrap()),
+            running: Running(child),
+        }
+    }
+
+    fn ends_well(mut self) {
+        let until = Instant::now() + PATIENCE;
+        while Instant::now() < until {
+            if let Some(status) = self.running.0.try_wait().unwrap() {
+                let said: Vec<_> = self.stderr.try_iter().collect();
+                assert!(status.success(), "{said:#?}");
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        panic!("it does not end");
+    }
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn it_is_waited_for_and_work_goes_on() {
+    let Some(server) = Server::start(&[]) else {
+        return;
+    };
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let url = runtime.block_on(server.database());
+    let folder = tempfile::tempdir().unwrap();
+    let (acquisition, archive) = (
+        folder.path().join("acquisition"),
+        folder.path().join("archive"),
+    );
+    simulate(&acquisition, "150,130,12");
+
+    // At the start of ingest.
+    server.kill();
+    let place = [text(&acquisition), text(&archive), "--catalog", &url];
+    let ingest = [&["ingest", "--once", "--lossless"], &place[..]].concat();
+    let ingest = Program::start(&ingest);
+    says(
+        &ingest.stderr,
+        "the catalog's server does not answer; start it",
+    );
+    server.run();
+    says(&ingest.stderr, "the catalog can be used now");
+    ingest.ends_well();
+
+    // At the start of the server.
+    server.kill();
+    let serve = ["serve", text(&archive), "--port", "0", "--catalog", &url];
+    let serve = Program::start(&serve);
+    says(
+        &serve.stderr,
+        "the catalog's server does not answer; start it",
+    );
+    assert!(serve.stdout.try_recv().is_err(), "it offers nothing yet");
+    server.run();
+    let address = says(&serve.stdout, "http://127.0.0.1:");
+    saccade_archive::tls::provide();
+    let status = |path: &str| {
+        let get = reqwest::get(format!("{address}{path}"));
+        let answer = runtime.block_on(get).unwrap();
+        answer.status().as_u16()
+    };
+    let names = runtime.block_on(saccade_source::remote::volumes(&address));
+    let name = names.unwrap().remove(0);
+    let metadata = format!("/v/{name}/zarr/zarr.json");
+    assert_eq!(status(&metadata), 200);
+
+    // While it serves: sections that nobody looked at cannot be looked up, which is told, and passes.
+    server.kill();
+    let chunk = format!("/v/{name}/zarr/0/c/0/0/0/0");
+    assert_eq!(status(&chunk), 503, "not an absent chunk, which is 404");
+    says(&serve.stderr, "server does not answer");
+    assert_eq!(status(&metadata), 200, "what is known stays");
+    server.run();
+    let until = Instant::now() + PATIENCE;
+    while status(&chunk) != 200 {
+        assert!(Instant::now() < until, "{} for good", status(&chunk));
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    drop(serve);
+}
