@@ -12,6 +12,7 @@ mod resample;
 mod section;
 mod serve;
 mod table_9_1;
+mod update;
 mod versus;
 
 use anyhow::Result;
@@ -30,6 +31,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: first_light::IDS,
         measure: |_| first_light::measure(),
+    },
+    Group {
+        ids: update::IDS,
+        measure: update::measure,
     },
     Group {
         ids: ingest::IDS,

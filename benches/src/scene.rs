@@ -92,9 +92,21 @@ impl Microscope {
         edge: u32,
         transform: SectionFromTile,
     ) -> Result<()> {
+        self.announce_as(tile, tile, section, edge, transform)
+    }
+
+    /// The same of a tile whose image was written as another's.
+    pub(crate) fn announce_as(
+        &mut self,
+        tile: &str,
+        image: &str,
+        section: u32,
+        edge: u32,
+        transform: SectionFromTile,
+    ) -> Result<()> {
         let record = TileRecord {
             tile: tile.to_owned(),
-            file: file(tile),
+            file: file(image),
             section,
             size: UVec2::splat(edge),
             transform,

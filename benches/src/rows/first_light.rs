@@ -133,7 +133,7 @@ async fn arrival(folder: &Path, pixels: &[u8]) -> Result<Times> {
 }
 
 /// Part of the pixels that changed by more than rounding.
-fn changed(a: &Image, b: &Image) -> f64 {
+pub(super) fn changed(a: &Image, b: &Image) -> f64 {
     let pairs = a.rgba.chunks_exact(4).zip(b.rgba.chunks_exact(4));
     let differs = |(a, b): (&[u8], &[u8])| a.iter().zip(b).any(|(a, b)| a.abs_diff(*b) > 4);
     pairs.map(differs).map(f64::from).sum::<f64>() / f64::from(a.size.element_product())
