@@ -64,7 +64,7 @@ impl EventParser {
         match field {
             "event" => self.event.kind = value.to_owned(),
             "data" => {
-                if self.has_data {
+                if self.has_data && self.event.data.len() < LONGEST {
                     self.event.data.push('\n');
                 }
                 self.has_data = true;
@@ -91,6 +91,7 @@ impl EventParser {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
 
     const STREAM: &str = "\u{feff}: hello\n\nevent: change\nid: 7\ndata: {\"a\":1}\n\n\
         data:x\r\ndata: y\r\n\r\nretry: 1500\rid\rdata\r\r\
@@ -140,5 +141,46 @@ mod tests {
             assert!(parser.feed(&vec![b'a'; LONGEST]).is_empty());
         }
         assert!(parser.line.len() <= LONGEST);
+        let mut parser = EventParser::default();
+        for _ in 0..3 {
+            assert!(parser.feed(&b"data\n".repeat(LONGEST / 2)).is_empty());
+        }
+        assert!(parser.event.data.len() <= LONGEST);
+    }
+
+    /// What streams are made of, right and wrong.
+    const PIECES: [&[u8]; 14] = [
+        b"data:",
+        b"event: change",
+        b"id:7",
+        b"id",
+        b"retry:99999999999999999999",
+        b"\n",
+        b"\r",
+        b"\r\n",
+        b"\n\n",
+        b": comment",
+        b"{\"revision\":1}",
+        b"\xef\xbb\xbf",
+        b"\xff\xfe\0",
+        b" ",
+    ];
+
+    proptest! {
+        #[test]
+        fn foreign_bytes_are_survived_however_they_are_cut(
+            pieces in prop::collection::vec(prop_oneof![
+                (0..PIECES.len()).prop_map(|n| PIECES[n].to_vec()),
+                prop::collection::vec(any::<u8>(), 0..9),
+            ], 0..60),
+            size in 1..17_usize,
+        ) {
+            let bytes = pieces.concat();
+            let mut whole = EventParser::default();
+            let mut cut = EventParser::default();
+            let seen: Vec<_> = bytes.chunks(size).flat_map(|piece| cut.feed(piece)).collect();
+            prop_assert_eq!(whole.feed(&bytes), seen);
+            prop_assert_eq!(whole.retry_ms(), cut.retry_ms());
+        }
     }
 }
