@@ -52,6 +52,9 @@ struct Arguments {
 }
 
 fn main() -> Result<()> {
+    if let Some(done) = rows::worker() {
+        return done;
+    }
     let arguments = Arguments::parse();
     let wanted = wanted(&arguments.ids)?;
     let settings = Settings {

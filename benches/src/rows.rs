@@ -14,6 +14,7 @@ mod serve;
 mod table_9_1;
 mod update;
 mod versus;
+mod workers;
 
 use anyhow::Result;
 
@@ -43,6 +44,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: ingest::MEMORY_IDS,
         measure: |_| ingest::measure_memory(),
+    },
+    Group {
+        ids: workers::IDS,
+        measure: workers::measure,
     },
     Group {
         ids: ingest::SIMULATE_IDS,
@@ -133,6 +138,8 @@ pub(crate) static GROUPS: &[Group] = &[
         measure: frame_cost::flight,
     },
 ];
+
+pub(crate) use workers::worker;
 
 /// A Tokio runtime as the command line uses it.
 fn runtime() -> Result<tokio::runtime::Runtime> {
