@@ -92,6 +92,51 @@ fn every_kind_of_change_is_told_and_seen() {
     });
 }
 
+/// What is told is the old and the new place, nothing between; and of four blocks in a row only those are built
+/// again that lie there.
+#[test]
+fn only_what_a_change_touches_is_built_again() {
+    run(async {
+        let extent = UVec3::new(2048, 140, 2);
+        let storage = Arc::new(MemoryStorage::new());
+        let mut fixture = Fixture::on(storage, extent, DVec3::new(4.0, 4.0, 30.0)).await;
+        let at = |x: f64| tile((200, 130), 0, (x, 4.0), 1.0, 1.0, 3);
+        for n in 0..4 {
+            let corner = f64::from(n) * 512.0 + 100.0;
+            fixture.put(&format!("t{n}"), at(corner)).await;
+        }
+        let source = fixture.open().await;
+        let mut changes = source.changes();
+        let read_finest = async || {
+            for x in (0..4).map(|block| block * 8 + 3) {
+                let chunk = UVec3::new(x, 0, 0);
+                source.read(ChunkId { chunk, ..FIRST }).await.unwrap();
+            }
+            source.statistics().blocks_built
+        };
+        let mut built = read_finest().await;
+        assert_eq!(built, 4);
+        let mut old = at(612.0);
+        // Within its block; to another; over the border of two.
+        for (to, again) in [(660.0, 1), (1700.0, 2), (1450.0, 2), (1950.0, 2)] {
+            let new = at(to);
+            fixture.transform("t1", new.transform).await;
+            let (from, to) = (place(&fixture, &old), place(&fixture, &new));
+            let want = if from.intersects(to) {
+                vec![from.union(to)]
+            } else {
+                vec![from, to]
+            };
+            for want in want {
+                assert_eq!(changes.next().await.unwrap().voxels, want);
+            }
+            let now = read_finest().await;
+            assert_eq!(now - built, again, "to {}", to.min.x);
+            (old, built) = (new, now);
+        }
+    });
+}
+
 #[derive(Clone, Debug)]
 enum Step {
     Put(usize, u32, (f64, f64), f64, u64),
