@@ -35,7 +35,7 @@ pub(crate) static GROUPS: &[Group] = &[
     },
     Group {
         ids: update::IDS,
-        measure: update::measure,
+        measure: |_| update::measure(),
     },
     Group {
         ids: ingest::IDS,
@@ -47,7 +47,7 @@ pub(crate) static GROUPS: &[Group] = &[
     },
     Group {
         ids: workers::IDS,
-        measure: workers::measure,
+        measure: |_| workers::measure(),
     },
     Group {
         ids: ingest::SIMULATE_IDS,
