@@ -29,11 +29,11 @@ pub(super) trait Append {
 
 impl Append for RecordWriter {
     fn append(&mut self, record: &Record) -> Result<(), AcquisitionError> {
-        RecordWriter::append(self, record)
+        Self::append(self, record)
     }
 
     fn sync(&self) -> Result<(), AcquisitionError> {
-        RecordWriter::sync(self)
+        Self::sync(self)
     }
 }
 

@@ -233,7 +233,7 @@ async fn a_growing_folder_is_followed() {
 async fn a_full_disk_is_waited_out() {
     let mut bare = Bare::new();
     for n in 0..30 {
-        bare.put(n, n as u8);
+        bare.put(n, u8::try_from(n).unwrap());
     }
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("catalog.sqlite");

@@ -271,11 +271,12 @@ fn each_pyramid_is_opened_once() {
             let other = mosaic.open(128 << 20, None).await;
             assert!(read(&source, level).await == read(&other, level).await);
             let without = opened(&mut mosaic, &source, false).await;
-            println!(
-                "pyramids opened with thumbnails {with:?}, with {bytes} bytes for them {without:?}"
-            );
             let most = without.iter().filter(|opened| **opened + 200 > section);
-            assert_eq!(most.count(), 5, "{without:?}");
+            assert_eq!(
+                most.count(),
+                5,
+                "with {bytes} bytes {without:?}, not {with:?}"
+            );
             assert!(source.statistics().thumbnail_bytes <= bytes);
         }
     });
