@@ -15,6 +15,7 @@ mod table_9_1;
 mod update;
 mod versus;
 mod workers;
+mod zarr_reads;
 
 use anyhow::Result;
 
@@ -68,6 +69,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: resample::IDS,
         measure: |_| resample::measure(),
+    },
+    Group {
+        ids: zarr_reads::IDS,
+        measure: |_| zarr_reads::measure(),
     },
     Group {
         ids: index::IDS,
