@@ -42,7 +42,7 @@ use serde_json::Value;
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
 use crate::stored::{StoredSource, volume_name};
-use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
+use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 use array::Array;
 use error::Refusal;
 pub use error::ZarrError;
@@ -81,13 +81,13 @@ impl ZarrSource {
     ///
     /// # Errors
     ///
-    /// [`SourceError::Open`] with a [`ZarrError`].
+    /// [`crate::SourceError::Open`] with a [`ZarrError`].
     #[cfg(not(target_family = "wasm"))]
-    pub async fn open_folder(folder: &std::path::Path) -> Result<Self, SourceError> {
+    pub async fn open_folder(folder: &std::path::Path) -> Result<Self, crate::SourceError> {
         let name = folder.file_name().unwrap_or_default().to_string_lossy();
         let objects = Arc::new(crate::objects::FolderObjects::new(folder));
         let opened = Self::open(objects, &name).await;
-        opened.map_err(|error| SourceError::Open {
+        opened.map_err(|error| crate::SourceError::Open {
             source: Arc::new(error),
             location: folder.display().to_string(),
         })

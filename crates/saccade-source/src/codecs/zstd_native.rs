@@ -3,26 +3,37 @@ use std::cell::RefCell;
 use bytes::Bytes;
 use zstd::bulk::Decompressor;
 
-use super::{Damage, too_much};
+use super::{Damage, read, too_much};
 
 thread_local! {
     static DECOMPRESSOR: RefCell<Option<Decompressor<'static>>> = const { RefCell::new(None) };
 }
 
 pub(super) fn decode(bytes: &[u8], most: usize) -> Result<Bytes, Damage> {
-    let mut decoded = Vec::with_capacity(most);
-    decode_to(bytes, &mut decoded)?;
-    Ok(decoded.into())
+    // Room is made for what the first frame says; where it says nothing, or there are others, for what comes.
+    let told = zstd::zstd_safe::get_frame_content_size(bytes)
+        .ok()
+        .flatten();
+    let frame = zstd::zstd_safe::find_frame_compressed_size(bytes);
+    match told {
+        Some(told) if told > most as u64 => Err(too_much(most)),
+        Some(told) if frame == Ok(bytes.len()) => {
+            let mut decoded = Vec::with_capacity(usize::try_from(told).unwrap_or(most));
+            decode_to(bytes, &mut decoded)?;
+            Ok(decoded.into())
+        }
+        _ => {
+            let decoder = zstd::stream::Decoder::with_buffer(bytes);
+            read(
+                decoder.map_err(|error| format!("it does not decompress: {error}"))?,
+                most,
+            )
+        }
+    }
 }
 
 /// Into a vector's capacity.
 fn decode_to(bytes: &[u8], decoded: &mut Vec<u8>) -> Result<(), Damage> {
-    let most = decoded.capacity();
-    if let Ok(Some(told)) = zstd::zstd_safe::get_frame_content_size(bytes)
-        && told > most as u64
-    {
-        return Err(too_much(most));
-    }
     DECOMPRESSOR.with_borrow_mut(|kept| {
         let failed = |error| format!("it does not decompress: {error}");
         let decompressor = match kept {

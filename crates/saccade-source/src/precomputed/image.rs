@@ -70,10 +70,10 @@ impl PrecomputedImage {
     /// About what a decoded chunk takes \[bytes\].
     pub(super) fn piece_bytes(&self) -> u64 {
         let scale = &self.info.scales[0];
-        self.shape(scale, scale.chunk.min(scale.size)).bytes() as u64
+        self.shape(scale.chunk.min(scale.size)).bytes() as u64
     }
 
-    fn shape(&self, _: &Scale, size: UVec3) -> Shape {
+    fn shape(&self, size: UVec3) -> Shape {
         Shape {
             size,
             channels: self.info.channels,
@@ -101,12 +101,14 @@ impl PrecomputedImage {
     async fn sample(&self) -> Result<Sample, PieceError> {
         let level = u32::try_from(self.info.scales.len() - 1).unwrap_or(0);
         let scale = self.scale(level);
-        let whole = VoxelBox::of_size(scale.size);
         let channels = self.info.channels.min(16);
-        let all = (0..channels).flat_map(|channel| self.touched(channel, level, whole));
-        let all: Vec<(PieceId, Place)> = all.collect();
-        let bytes = self.shape(scale, scale.chunk.min(scale.size)).bytes();
-        let (chosen, partial) = sampled(&all, bytes);
+        let piece = scale.chunk.min(scale.size);
+        let (boxes, partial) = sampled(scale.size, piece, self.shape(piece).bytes(), channels);
+        let touched = (0..channels).flat_map(|channel| {
+            let of_box = move |voxels: &VoxelBox| self.touched(channel, level, *voxels);
+            boxes.iter().flat_map(of_box)
+        });
+        let chosen: Vec<(PieceId, Place)> = touched.collect();
         let mut sample = Sample::new(partial || level > 0);
         for (id, place) in chosen {
             for (_, raw) in self.raw(level, vec![id], None).await {
@@ -150,7 +152,7 @@ impl PrecomputedImage {
         values: Option<&Arc<Values>>,
     ) -> Raw {
         let scale = self.scale(id.level);
-        let shape = self.shape(scale, self.chunk(id).1.size());
+        let shape = self.shape(self.chunk(id).1.size());
         let encoding = scale.encoding;
         let zipped = scale.sharding.is_some_and(|sharding| sharding.data_gzip);
         let most = self.most_encoded(scale);
@@ -185,7 +187,7 @@ impl PrecomputedImage {
 
     /// Longest that an encoded chunk can sensibly be \[bytes\].
     fn most_encoded(&self, scale: &Scale) -> u64 {
-        let decoded = self.shape(scale, scale.chunk.min(scale.size)).bytes() as u64;
+        let decoded = self.shape(scale.chunk.min(scale.size)).bytes() as u64;
         // Tables and headers of compressed_segmentation, for the smallest blocks.
         decoded * 4 + (64 << 10)
     }

@@ -1,5 +1,8 @@
 //! Some values of an image, by which to choose how all of them are shown.
 
+use glam::UVec3;
+use saccade_core::voxel_box::VoxelBox;
+
 use super::{Place, copy};
 use crate::values::{Number, Spread, Values};
 
@@ -7,11 +10,32 @@ use crate::values::{Number, Spread, Values};
 const MOST_PIECES: usize = 64;
 const MOST_BYTES: usize = 64 << 20;
 
-/// Some of these, evenly; whether others are left.
-pub(crate) fn sampled<T: Clone>(all: &[T], bytes_each: usize) -> (Vec<T>, bool) {
-    let most = (MOST_BYTES / bytes_each.max(1)).clamp(1, MOST_PIECES);
-    let step = all.len().div_ceil(most).max(1);
-    (all.iter().step_by(step).cloned().collect(), step > 1)
+/// Boxes of a level whose pieces are looked at, of each of some channels; whether others are left. Pieces are of `piece` voxels
+/// and `bytes_each` bytes.
+pub(crate) fn sampled(
+    extent: UVec3,
+    piece: UVec3,
+    bytes_each: usize,
+    channels: u32,
+) -> (Vec<VoxelBox>, bool) {
+    let most = (MOST_BYTES / bytes_each.max(1)).clamp(1, MOST_PIECES) as u64;
+    let most = (most / u64::from(channels.max(1))).max(1);
+    let cells = extent.to_array().into_iter().zip(piece.to_array());
+    let cells = cells.map(|(extent, piece)| u64::from(extent.div_ceil(piece.max(1))));
+    if cells.fold(1_u64, u64::saturating_mul) <= most {
+        return (vec![VoxelBox::of_size(extent)], false);
+    }
+    let per_axis = (1..=4_u32)
+        .rev()
+        .find(|n| u64::from(n.pow(3)) <= most)
+        .unwrap_or(1);
+    let middles = VoxelBox::of_size(UVec3::splat(per_axis));
+    let boxes = middles.iter().map(|at| {
+        let middle = (at.as_dvec3() + 0.5) / f64::from(per_axis) * extent.as_dvec3();
+        let voxel = middle.as_uvec3().min(extent - 1);
+        VoxelBox::new(voxel, voxel + 1)
+    });
+    (boxes.collect(), true)
 }
 
 /// The values seen so far.
@@ -84,5 +108,29 @@ impl Sample {
             }
         }
         Values::fitted(number, big_endian, self.spread, names)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_levels_are_looked_at_wholly_and_large_ones_here_and_there() {
+        let small = sampled(UVec3::new(100, 90, 9), UVec3::splat(64), 1 << 18, 2);
+        assert_eq!(
+            small,
+            (vec![VoxelBox::of_size(UVec3::new(100, 90, 9))], false)
+        );
+        let extent = UVec3::new(1 << 20, 3, 1 << 19);
+        let (boxes, partial) = sampled(extent, UVec3::ONE, 4, 1);
+        assert!(partial && boxes.len() == 64);
+        let whole = VoxelBox::of_size(extent);
+        assert!(
+            boxes
+                .iter()
+                .all(|b| b.voxels() == 1 && whole.contains(b.min))
+        );
+        assert_eq!(sampled(extent, UVec3::splat(512), 1 << 30, 9).0.len(), 1);
     }
 }

@@ -235,10 +235,19 @@ impl ZarrImage {
     async fn sample(&self) -> Result<Sample, PieceError> {
         let level = self.levels.len() - 1;
         let array = &self.levels[level];
-        let whole = VoxelBox::of_size(array.extent);
-        let touched = (0..array.channels.min(16)).flat_map(|channel| array.touched(channel, whole));
-        let all: Vec<(u64, Place)> = touched.collect();
-        let (chosen, partial) = sampled(&all, array.array.chunk_bytes());
+        let mut piece = UVec3::ONE;
+        for (axis, chunk) in array.axes.iter().zip(&array.array.chunk) {
+            if let Axis::Space(axis) = axis {
+                piece[*axis] = u32::try_from(*chunk).unwrap_or(u32::MAX);
+            }
+        }
+        let channels = array.channels.min(16);
+        let (boxes, partial) = sampled(array.extent, piece, array.array.chunk_bytes(), channels);
+        let touched = (0..channels).flat_map(|channel| {
+            let of_box = move |voxels: &VoxelBox| array.touched(channel, *voxels);
+            boxes.iter().flat_map(of_box)
+        });
+        let chosen: Vec<(u64, Place)> = touched.collect();
         let mut sample = Sample::new(partial || level > 0);
         let number = array.number();
         for (piece, place) in chosen {

@@ -14,6 +14,7 @@ use serde_json::json;
 use saccade_core::voxel_box::VoxelBox;
 
 use super::*;
+use crate::SourceError;
 use crate::conformance::{check_reading, check_volume};
 
 /// Finest voxels, odd on every axis \[x, y, z\].
