@@ -308,7 +308,8 @@ pub(crate) fn leaf_sizes(settings: &Settings) -> Result<Vec<Row>> {
             };
         }
         settings.plot(&plot, &format!("fig_{figure}"))?;
-        let mut row = Row::new(id, "32³ leaves over 8 × 8 × 4", gain).setting("channels", most);
+        let mut row = Row::new(id, "32³ leaves over 8 × 8 × 4", gain)
+            .setting("channels", counts.last().copied());
         for (name, line) in names.iter().zip(&lines) {
             row = row.setting(name, serde_json::to_value(line)?);
         }
