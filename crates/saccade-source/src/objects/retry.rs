@@ -19,7 +19,7 @@ pub struct Patience {
     pub longest_wait: Duration,
     /// An answer of which nothing more came for so long has failed.
     pub idle: Duration,
-    /// An answer must come faster than this, counted from its beginning on, after [`Self::idle`] has passed
+    /// An answer must come faster than this, counted from its beginning on, after `idle` has passed
     /// \[bytes/s\].
     pub slowest: u32,
 }
