@@ -115,7 +115,7 @@ fn it_is_waited_for_and_work_goes_on() {
     let address = says(&serve.stdout, "http://127.0.0.1:");
     saccade_archive::tls::provide();
     let status = |path: &str| {
-        let get = reqwest::get(format!("{address}{path}"));
+        let get = reqwest::get(format!("{}{path}", address.trim_end_matches('/')));
         let answer = runtime.block_on(get).unwrap();
         answer.status().as_u16()
     };
