@@ -93,7 +93,7 @@ impl Bare {
             return false;
         }
         for (name, seed) in &self.images {
-            if pixels(archive, &tiles[name]).await != texture(SIZE, *seed) {
+            if pixels(&tiles[name]).await != texture(SIZE, *seed) {
                 return false;
             }
         }

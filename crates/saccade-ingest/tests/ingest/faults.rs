@@ -48,7 +48,7 @@ impl Bench {
         assert_eq!(tiles.len(), usize::from(TILES));
         for n in 0..TILES {
             let tile = &tiles[&format!("t{n}")];
-            assert_eq!(pixels(&self.archive, tile).await, texture(SIZE, n));
+            assert_eq!(pixels(tile).await, texture(SIZE, n));
         }
         assert!(orphans(&self.archive).await.is_empty());
         assert!(

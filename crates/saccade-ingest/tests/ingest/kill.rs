@@ -375,7 +375,7 @@ async fn check_whole(archive: &VisualizationArchive, done: u64) {
         return;
     }
     for (name, tile) in seen(archive).await {
-        let values = pixels(archive, &tile).await;
+        let values = pixels(&tile).await;
         assert!(values.iter().all(|v| *v > 0), "tile {name} has holes");
     }
 }

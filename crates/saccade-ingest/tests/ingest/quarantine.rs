@@ -265,8 +265,5 @@ async fn a_mended_tile_leaves_quarantine() {
             .unwrap()
             .is_empty()
     );
-    assert_eq!(
-        pixels(&archive, &seen(&archive).await["a"]).await,
-        texture(SIZE, 5)
-    );
+    assert_eq!(pixels(&seen(&archive).await["a"]).await, texture(SIZE, 5));
 }

@@ -12,6 +12,7 @@ use saccade_archive::acquisition::{
     AcquisitionInfo, Record, RecordWriter, TileRecord, TransformRecord,
 };
 use saccade_archive::pyramid::{Encoding, PyramidIndex, SUB_TILE_EDGE};
+use saccade_archive::storage::{MemoryStorage, Storage as _, StorageError};
 use saccade_core::transform::SectionFromTile;
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
 use saccade_ingest::{Cancel, Progress, State};
@@ -154,10 +155,26 @@ pub(crate) struct Seen {
 
 /// Everything in the volume.
 pub(crate) async fn seen(archive: &VisualizationArchive) -> BTreeMap<String, Seen> {
+    // A tile that is imaged again while it is read takes its old pyramid away: then look again.
+    for _ in 0..50 {
+        match seen_at_once(archive).await {
+            Ok(tiles) => return tiles,
+            Err(StorageError::NotFound { .. }) => {
+                tokio::time::sleep(Duration::from_millis(20)).await
+            }
+            Err(error) => panic!("{error}"),
+        }
+    }
+    panic!("a pyramid is missing for good")
+}
+
+async fn seen_at_once(
+    archive: &VisualizationArchive,
+) -> Result<BTreeMap<String, Seen>, StorageError> {
     let mut tiles = BTreeMap::new();
     for z in archive.catalog().sections(VOLUME).await.unwrap() {
         for tile in archive.catalog().section_tiles(VOLUME, z).await.unwrap() {
-            let bytes = archive.storage().read(&tile.pyramid, None).await.unwrap();
+            let bytes = archive.storage().read(&tile.pyramid, None).await?;
             let (section, size, pyramid) = (tile.section, tile.size, tile.pyramid);
             let transform = tile.transform.elements();
             tiles.insert(
@@ -172,12 +189,14 @@ pub(crate) async fn seen(archive: &VisualizationArchive) -> BTreeMap<String, See
             );
         }
     }
-    tiles
+    Ok(tiles)
 }
 
-/// The finest level of a pyramid.
-pub(crate) async fn pixels(archive: &VisualizationArchive, tile: &Seen) -> Vec<u8> {
-    let storage = archive.storage().as_ref();
+/// The finest level of a pyramid, as it was when the tile was seen.
+pub(crate) async fn pixels(tile: &Seen) -> Vec<u8> {
+    let storage = &MemoryStorage::new();
+    let write = storage.write_durable(&tile.pyramid, tile.bytes.clone());
+    write.await.unwrap();
     let index = PyramidIndex::open(storage, &tile.pyramid).await.unwrap();
     let level = &index.levels()[0];
     assert_eq!([level.width, level.height], tile.size.to_array());

@@ -55,7 +55,7 @@ async fn pixels_arrive_as_they_left() {
         let tile = &tiles[&format!("t{n}")];
         assert_eq!((tile.section, tile.size), (u32::from(n), size));
         assert_eq!(tile.transform, at(10.0, 20.0).elements());
-        let values = pixels(&archive, tile).await;
+        let values = pixels(tile).await;
         assert!(values == texture(size, n), "tile {n}");
         assert!(
             size == UVec2::ONE || values != texture(size, n + 1),
@@ -86,7 +86,7 @@ async fn jpeg_is_close_and_lossless_is_not_jpeg() {
         .await
         .unwrap();
     let tile = &seen(&archive).await["a"];
-    let (got, want) = (pixels(&archive, tile).await, texture(SIZE, 1));
+    let (got, want) = (pixels(tile).await, texture(SIZE, 1));
     assert_ne!(got, want);
     let error: u64 = got
         .iter()
@@ -114,7 +114,7 @@ async fn a_tile_imaged_again_takes_its_own_place() {
     let tiles = seen(&archive).await;
     assert_eq!(tiles.len(), 1);
     assert_eq!(tiles["a"].size, smaller);
-    assert_eq!(pixels(&archive, &tiles["a"]).await, texture(smaller, 2));
+    assert_eq!(pixels(&tiles["a"]).await, texture(smaller, 2));
     // Whoever still reads the old one can, for a while.
     assert_ne!(tiles["a"].pyramid, first.pyramid);
     assert_eq!(
@@ -235,7 +235,7 @@ async fn a_stream_is_followed_until_cancelled() {
     assert_eq!((summary.tiles, summary.quarantined), (4, 0));
     let tiles = seen(&archive).await;
     for (n, tile) in (1..).zip(tiles.values()) {
-        assert_eq!(pixels(&archive, tile).await, texture(SIZE, n));
+        assert_eq!(pixels(tile).await, texture(SIZE, n));
     }
 }
 
@@ -267,10 +267,7 @@ async fn a_record_that_waits_survives_the_process() {
     // Its line was read, and is not read again; but the tile comes.
     scope.image("a", SIZE, 9);
     assert_eq!(scope.ingest(&archive).await.tiles, 1);
-    assert_eq!(
-        pixels(&archive, &seen(&archive).await["a"]).await,
-        texture(SIZE, 9)
-    );
+    assert_eq!(pixels(&seen(&archive).await["a"]).await, texture(SIZE, 9));
 }
 
 #[tokio::test]
