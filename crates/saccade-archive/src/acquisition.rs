@@ -24,7 +24,7 @@ use std::io;
 use std::path::{Component, Path, PathBuf};
 
 use glam::{DVec3, UVec3};
-use saccade_core::volume::{Dtype, Volume, VolumeError};
+use saccade_core::volume::{Dtype, Volume, VolumeError, VoxelKind};
 use serde::{Deserialize, Serialize};
 
 pub use record::{
@@ -147,23 +147,6 @@ pub struct AcquisitionInfo {
     pub kind: VoxelKind,
 }
 
-/// What voxels are.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum VoxelKind {
-    /// Shades: coarser levels are averages.
-    #[default]
-    Intensity,
-    /// Numbers of objects: coarser levels show the most frequent.
-    Labels,
-}
-
-impl VoxelKind {
-    fn is_intensity(&self) -> bool {
-        *self == Self::Intensity
-    }
-}
-
 fn uint8() -> Dtype {
     Dtype::Uint8
 }
@@ -235,6 +218,7 @@ impl AcquisitionInfo {
     pub fn volume(&self) -> Result<Volume, VolumeError> {
         let mut volume = Volume::new(&self.name, self.extent, self.voxel_nm)?;
         volume.dtype = self.dtype;
+        volume.kind = self.kind;
         if !self.channels.is_empty() {
             volume.channels.clone_from(&self.channels);
         }

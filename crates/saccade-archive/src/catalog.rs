@@ -309,12 +309,12 @@ impl Catalog {
         self
     }
 
-    /// Enters a volume. It is fine if it is there already and has the same size.
+    /// Enters a volume. It is fine if it is there already and is the same: in size, voxels and
+    /// channels.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::VolumeName`], [`CatalogError::WrongExtent`],
-    /// [`CatalogError::WrongVoxelSize`], or what the database says.
+    /// [`CatalogError::VolumeName`], [`CatalogError::WrongVolume`], or what the database says.
     pub async fn create_volume(&self, volume: &Volume) -> Result<(), CatalogError> {
         check_name(&volume.name)?;
         let there = match self.volume(&volume.name).await {
@@ -324,24 +324,28 @@ impl Catalog {
             }
             there => there?,
         };
-        let name = volume.name.clone();
-        if there.extent() != volume.extent() {
-            let (existing, asked) = (there.extent(), volume.extent());
-            return Err(CatalogError::WrongExtent {
+        let differs = |what, existing: String, asked: String| {
+            let same = existing == asked;
+            let name = volume.name.clone();
+            (!same).then_some(CatalogError::WrongVolume {
                 name,
+                what,
                 existing,
                 asked,
-            });
-        }
-        if there.voxel_nm != volume.voxel_nm {
-            let (existing, asked) = (there.voxel_nm, volume.voxel_nm);
-            return Err(CatalogError::WrongVoxelSize {
-                name,
-                existing,
-                asked,
-            });
-        }
-        Ok(())
+            })
+        };
+        let of = |v: &Volume| {
+            [
+                ("extent", format!("{} voxels", v.extent())),
+                ("voxel size", format!("{} nm", v.voxel_nm)),
+                ("voxel type", format!("{:?}", v.dtype).to_lowercase()),
+                ("kind", format!("{:?}", v.kind).to_lowercase()),
+                ("channels", v.channels.join(", ")),
+            ]
+        };
+        let pairs = of(&there).into_iter().zip(of(volume));
+        let wrong = pairs.map(|((what, existing), (_, asked))| differs(what, existing, asked));
+        wrong.flatten().next().map_or(Ok(()), Err)
     }
 
     async fn insert_volume(&self, volume: &Volume) -> Result<(), CatalogError> {

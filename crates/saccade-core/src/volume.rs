@@ -28,6 +28,29 @@ impl Dtype {
     }
 }
 
+/// What voxels are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum VoxelKind {
+    /// Shades: coarser levels are averages.
+    #[default]
+    Intensity,
+    /// Numbers of objects: coarser levels show the most frequent, nothing is interpolated.
+    Labels,
+}
+
+impl VoxelKind {
+    /// Whether voxels are shades, as they are where nothing is said.
+    pub fn is_intensity(&self) -> bool {
+        *self == Self::Intensity
+    }
+
+    /// Whether voxels are numbers of objects.
+    pub fn is_labels(&self) -> bool {
+        *self == Self::Labels
+    }
+}
+
 /// A virtual 3D image: its shape is known, its voxels may not exist yet.
 ///
 /// Value 0 means "nothing was acquired here"; sources keep measured values at 1 or above.
@@ -37,6 +60,9 @@ pub struct Volume {
     pub name: String,
     /// Value type of every channel.
     pub dtype: Dtype,
+    /// What the voxels of every channel are.
+    #[serde(default, skip_serializing_if = "VoxelKind::is_intensity")]
+    pub kind: VoxelKind,
     /// Names of the channels; at least one.
     pub channels: Vec<String>,
     /// Voxel size at level 0 \[nm\].
@@ -123,6 +149,7 @@ impl Volume {
         Ok(Self {
             name: name.to_owned(),
             dtype: Dtype::Uint8,
+            kind: VoxelKind::Intensity,
             channels: vec!["intensity".to_owned()],
             voxel_nm,
             levels: halving_levels(extent, voxel_nm),

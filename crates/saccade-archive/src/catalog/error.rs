@@ -1,4 +1,4 @@
-use glam::{DVec3, UVec3};
+use glam::UVec3;
 use saccade_core::volume::VolumeError;
 
 use super::CatalogLocation;
@@ -125,31 +125,20 @@ pub enum CatalogError {
     /// The name cannot be used in addresses and file names.
     #[error(transparent)]
     VolumeName(#[from] VolumeError),
-    /// A volume of that name has another size.
+    /// A volume of that name is another.
     #[error(
-        "wrong extent: volume {name:?} has {existing} voxels in the catalog, but {asked} now; give \
-         the new volume another name, or use another archive folder"
+        "wrong {what}: volume {name:?} has {existing} in the catalog, but {asked} now; give the new \
+         volume another name, or use another archive folder"
     )]
-    WrongExtent {
+    WrongVolume {
         /// The volume.
         name: String,
-        /// In the catalog \[voxels\].
-        existing: UVec3,
-        /// As asked for \[voxels\].
-        asked: UVec3,
-    },
-    /// A volume of that name has other voxels.
-    #[error(
-        "wrong voxel size: volume {name:?} has {existing} nm in the catalog, but {asked} nm now; give \
-         the new volume another name, or use another archive folder"
-    )]
-    WrongVoxelSize {
-        /// The volume.
-        name: String,
-        /// In the catalog \[nm\].
-        existing: DVec3,
-        /// As asked for \[nm\].
-        asked: DVec3,
+        /// What differs.
+        what: &'static str,
+        /// In the catalog.
+        existing: String,
+        /// As asked for.
+        asked: String,
     },
     /// A tile would lie where no voxel is.
     #[error(

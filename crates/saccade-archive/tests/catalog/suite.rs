@@ -12,7 +12,7 @@ use saccade_archive::catalog::{
     place as cover,
 };
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{Dtype, Volume, VoxelKind};
 
 use crate::place::Place;
 
@@ -537,13 +537,26 @@ pub(crate) async fn other_sizes_and_unknown_names_are_refused(place: &Place) {
     let catalog = place.catalog().await;
     catalog.create_volume(&volume("v")).await.unwrap();
     let nm = DVec3::new(4.0, 4.0, 40.0);
-    let larger = Volume::new("v", EXTENT + 1, nm).unwrap();
-    let refused = catalog.create_volume(&larger).await.unwrap_err();
-    assert!(matches!(refused, CatalogError::WrongExtent { .. }));
-    assert!(refused.to_string().starts_with("wrong extent"), "{refused}");
-    let coarser = Volume::new("v", EXTENT, nm * 2.0).unwrap();
-    let refused = catalog.create_volume(&coarser).await;
-    assert!(matches!(refused, Err(CatalogError::WrongVoxelSize { .. })));
+    let with = |change: fn(&mut Volume)| {
+        let mut volume = volume("v");
+        change(&mut volume);
+        volume
+    };
+    for (what, other) in [
+        ("extent", Volume::new("v", EXTENT + 1, nm).unwrap()),
+        ("voxel size", Volume::new("v", EXTENT, nm * 2.0).unwrap()),
+        ("voxel type", with(|v| v.dtype = Dtype::Uint16)),
+        ("kind", with(|v| v.kind = VoxelKind::Labels)),
+        ("channels", with(|v| v.channels.push("actin".to_owned()))),
+    ] {
+        let refused = catalog.create_volume(&other).await.unwrap_err();
+        let named = matches!(&refused, CatalogError::WrongVolume { what: w, .. } if *w == what);
+        assert!(named, "{what}: {refused}");
+        assert!(
+            refused.to_string().starts_with(&format!("wrong {what}")),
+            "{refused}"
+        );
+    }
     assert_eq!(
         catalog.volume("v").await.unwrap(),
         volume("v"),

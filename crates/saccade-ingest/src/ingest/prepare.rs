@@ -7,15 +7,13 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
-use saccade_archive::acquisition::{
-    DeleteRecord, TileRecord, TransformRecord, VoxelKind, image_path,
-};
+use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord, image_path};
 use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
 use saccade_archive::storage::Storage;
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::Dtype;
+use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::IngestError;
 use crate::progress::Progress;

@@ -83,7 +83,7 @@ pub async fn run(
     }
     let catalog = archive.catalog();
     retry(options, progress, || catalog.create_volume(&volume)).await?;
-    let (stored, why) = Stored::new(volume.dtype, info.kind, options.encoding);
+    let (stored, why) = Stored::new(volume.dtype, volume.kind, options.encoding);
     if let Some(why) = why {
         progress.notice(why);
     }

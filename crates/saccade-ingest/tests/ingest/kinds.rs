@@ -4,9 +4,9 @@ use std::fs;
 use std::io::Cursor;
 
 use glam::UVec2;
-use saccade_archive::acquisition::{ChannelRef, DeleteRecord, Record, VoxelKind};
+use saccade_archive::acquisition::{ChannelRef, DeleteRecord, Record};
 use saccade_archive::pyramid::{Encoding, PyramidIndex};
-use saccade_core::volume::Dtype;
+use saccade_core::volume::{Dtype, VoxelKind};
 use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, run};
 use tiff::encoder::{TiffEncoder, colortype};

@@ -292,7 +292,7 @@ async fn wrong_archives_are_refused() {
     assert!(
         matches!(
             other,
-            IngestError::Catalog(CatalogError::WrongExtent { .. })
+            IngestError::Catalog(CatalogError::WrongVolume { what: "extent", .. })
         ),
         "{other}"
     );
