@@ -53,7 +53,8 @@ impl VoxelKind {
 
 /// A virtual 3D image: its shape is known, its voxels may not exist yet.
 ///
-/// Value 0 means "nothing was acquired here"; sources keep measured values at 1 or above.
+/// Value 0 means "nothing was acquired here"; sources keep measured values at 1 or above. Among labels 0 is
+/// no object as well.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Volume {
     /// Name in addresses and file names.

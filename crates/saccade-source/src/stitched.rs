@@ -23,10 +23,19 @@
 //! - The value is interpolated linearly, or as [`Interpolation`] says, in the pyramid level whose pixels are most like the voxel
 //!   in size, with the tile's edge pixels repeated outward; it is at least 1. Where no tile is: 0.
 //! - Where a voxel is larger than the pixels of a tile's coarsest level, it is the mean of 2 x 2,
-//!   4 x 4, at most 16 x 16 such samples, those that are 0 left out. The largest tile pixels near
+//!   4 x 4, at most 16 x 16 such samples, those where no tile is left out. The largest tile pixels near
 //!   decide how many; where tiles of a section differ in size, it is the same number for all. Coarsest
 //!   levels stay in memory when their pyramids are closed, and on disk over restarts: coarse
 //!   voxels open each pyramid once.
+//!
+//! # Labels
+//!
+//! Numbers of objects ([`VoxelKind::Labels`](saccade_core::volume::VoxelKind::Labels)) are never mixed, whatever is asked for: every voxel of every level is a
+//! label that a tile has near there, or 0. Each is that of the nearest pixel, tile and section, and gaps are filled from
+//! the nearer side. Pixels of pyramids are the most frequent of the pixels they cover, of several the
+//! smallest; so is a voxel that is larger than those of the coarsest level, of the samples where a tile is. 0, no object, is
+//! a label like any other: a tile hides others where it has 0, whole blank sub-tiles included, and 0 counts among
+//! samples.
 //!
 //! # Changes
 //!
@@ -70,7 +79,7 @@ use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource};
 use block::{BlockGrid, CutChunk};
 use blocks::Blocks;
-use build::{Builder, Place};
+use build::{Builder, Place, Rules};
 use tiles::Tiles;
 
 pub use along_z::{AlongZ, Gaps};
@@ -97,8 +106,9 @@ pub struct StitchedOptions {
     pub section_bytes: u64,
     /// Blocks built at a time.
     pub builds: usize,
-    /// What lies between pixels.
-    pub interpolation: Interpolation,
+    /// What lies between pixels; `None`: linearly between shades, and of labels, of which there is nothing in between,
+    /// the nearest pixel. These three and [`Gaps::Linear`] are not done to labels, which is told when the volume is opened.
+    pub interpolation: Option<Interpolation>,
     /// What is seen where tiles overlap.
     pub overlaps: Overlaps,
     /// What a voxel is that spans several sections.
@@ -120,7 +130,7 @@ impl Default for StitchedOptions {
             index_bytes: 64 << 20,
             thumbnail_bytes: 128 << 20,
             section_bytes: 256 << 20,
-            interpolation: Interpolation::Linear,
+            interpolation: None,
             overlaps: Overlaps::NearestCentre,
             along_z: AlongZ::Nearest,
             gaps: Gaps::Empty,
@@ -233,7 +243,15 @@ impl StitchedSource {
             }
             None => None,
         };
-        let tiles = Tiles::new(archive, index, volume.dtype, disk.clone(), &options);
+        let refused = Rules::refused(&options, volume.kind);
+        if !refused.is_empty() {
+            log::warn!(
+                "volume {name:?} holds labels, which are not mixed: it is stitched from nearest pixels, tiles and \
+                 sections, without {}",
+                refused.join(", ")
+            );
+        }
+        let tiles = Tiles::new(archive, index, &volume, disk.clone(), &options);
         let inner = Arc::new(Inner {
             disk,
             from_disk: AtomicU64::new(0),

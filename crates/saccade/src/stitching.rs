@@ -11,9 +11,10 @@ use crate::report::say;
 #[derive(Args)]
 #[command(next_help_heading = "Stitching (of an archive)")]
 pub(crate) struct Stitching {
-    /// What lies between pixels
-    #[arg(long, value_enum, default_value_t = Between::Linear)]
-    interpolation: Between,
+    /// What lies between pixels; labels are never mixed, whatever is chosen here and below [default: linear, and
+    /// nearest of labels]
+    #[arg(long, value_enum)]
+    interpolation: Option<Between>,
 
     /// What is seen where tiles overlap: the tile whose centre is nearest, or a mean that fades
     /// towards each tile's edges
@@ -39,7 +40,7 @@ pub(crate) struct Stitching {
 
 #[derive(Clone, Copy, ValueEnum)]
 enum Between {
-    /// The value of the nearest pixel, as labels need it
+    /// The value of the nearest pixel
     Nearest,
     /// In proportion between four pixels
     Linear,
@@ -78,11 +79,11 @@ impl Stitching {
             }
         };
         StitchedOptions {
-            interpolation: match self.interpolation {
+            interpolation: self.interpolation.map(|between| match between {
                 Between::Nearest => Interpolation::Nearest,
                 Between::Linear => Interpolation::Linear,
                 Between::Cubic => Interpolation::Cubic,
-            },
+            }),
             overlaps: match self.overlaps {
                 Overlapping::Nearest => Overlaps::NearestCentre,
                 Overlapping::Blend => Overlaps::Blend,

@@ -4,7 +4,7 @@ use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
-use super::average::{level0_voxels, mean};
+use super::average::{coarser, level0_voxels};
 use super::{build_chunk, only_bytes};
 use crate::changes::Changes;
 use crate::maybe_send::{BoxFuture, BoxStream};
@@ -12,7 +12,8 @@ use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId, ValueRange, Volume
 
 /// A small 8-bit volume held whole, all its levels too. Voxels can be set while it is watched.
 ///
-/// Coarser levels are means of the level-0 voxels that are not 0.
+/// Coarser levels are means of the level-0 voxels that are not 0; of labels, the most frequent, of several the
+/// smallest.
 pub struct ArraySource {
     volume: Arc<Volume>,
     /// Per level `[c, z, y, x]`.
@@ -98,13 +99,14 @@ impl ArraySource {
     fn average(&self, level0: VoxelBox) {
         let extent = self.volume.extent();
         let mut levels = self.levels.write().unwrap_or_else(PoisonError::into_inner);
-        let (finest, coarser) = levels.split_first_mut().expect("a volume has a level");
-        for (level, values) in self.volume.levels[1..].iter().zip(coarser) {
+        let (finest, others) = levels.split_first_mut().expect("a volume has a level");
+        for (level, values) in self.volume.levels[1..].iter().zip(others) {
             for channel in 0..self.volume.channels.len() {
                 for voxel in level.box_from_voxels(level0).iter() {
                     let covered = level0_voxels(voxel, level.downsampling, extent);
+                    let covered = covered.iter().map(|v| finest[index(extent, channel, v)]);
                     values[index(level.extent, channel, voxel)] =
-                        mean(covered.iter().map(|v| finest[index(extent, channel, v)]));
+                        coarser(self.volume.kind, covered);
                 }
             }
         }

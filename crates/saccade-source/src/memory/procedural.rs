@@ -4,7 +4,7 @@ use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
-use super::average::{level0_voxels, mean};
+use super::average::{coarser, level0_voxels};
 use super::{build_chunk, only_bytes};
 use crate::changes::Changes;
 use crate::maybe_send::{BoxFuture, BoxStream};
@@ -48,7 +48,8 @@ impl ProceduralSource {
     }
 
     /// `value` gives a level-0 voxel. Voxels of coarser levels are means of those they cover and
-    /// that are not 0, or of a regular 4 x 4 x 4 choice of them where they cover more.
+    /// that are not 0, or of a regular 4 x 4 x 4 choice of them where they cover more; those of labels are the
+    /// most frequent of these, of several the smallest.
     ///
     /// # Panics
     ///
@@ -58,7 +59,7 @@ impl ProceduralSource {
         acquired: VoxelBox,
         value: impl Fn(UVec3) -> u8 + Send + Sync + 'static,
     ) -> Self {
-        let levels = volume.levels.clone();
+        let (levels, kind) = (volume.levels.clone(), volume.kind);
         Self::new(volume, acquired, move |level, voxel| {
             if level == 0 {
                 return value(voxel);
@@ -71,7 +72,7 @@ impl ProceduralSource {
                 // The middle of each of `samples` equal parts; every voxel where there are few.
                 covered.min + (s * 2 + 1) * size / (samples * 2)
             });
-            mean(chosen.map(&value))
+            coarser(kind, chosen.map(&value))
         })
     }
 

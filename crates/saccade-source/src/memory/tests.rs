@@ -3,7 +3,7 @@
 use futures::{FutureExt, StreamExt};
 use glam::{DVec3, UVec3};
 use pollster::block_on;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 
 use super::*;
@@ -137,6 +137,41 @@ fn procedures_conform() {
         0,
     ))
     .unwrap();
+}
+
+/// The label that most level-0 voxels of a voxel have, of several the smallest, by definition.
+fn most_frequent(volume: &Volume, value: impl Fn(UVec3) -> u8, id: ChunkId) -> Vec<u8> {
+    let level = volume.levels[id.level as usize];
+    let by = level.downsampling.as_uvec3();
+    let voxels = VoxelBox::of_size(volume.chunk).iter();
+    let winner = voxels.map(|v| {
+        let v = v + id.chunk * volume.chunk;
+        let covered = VoxelBox::new(v * by, (v + 1) * by);
+        let covered = covered.intersection(VoxelBox::of_size(volume.extent()));
+        let mut labels: Vec<u8> = covered.iter().map(&value).collect();
+        labels.sort_unstable();
+        let runs: Vec<&[u8]> = labels.chunk_by(|a, b| a == b).collect();
+        let most = runs.iter().map(|run| run.len()).max();
+        let first = runs.iter().find(|run| Some(run.len()) == most);
+        first.map_or(0, |run| run[0])
+    });
+    winner.collect()
+}
+
+#[test]
+fn labels_in_memory_are_never_averaged() {
+    let mut volume = volume();
+    volume.kind = VoxelKind::Labels;
+    let value = |v: UVec3| [0, 3, 90, 200][usize::from(level0(v)) / 5 % 4];
+    let oracle = |id| most_frequent(&volume, value, id);
+    let values = VoxelBox::of_size(volume.extent()).iter().map(value);
+    let array = ArraySource::new(volume.clone(), values.collect()).unwrap();
+    block_on(check_reading(&array, oracle, 0)).unwrap();
+    let acquired = VoxelBox::of_size(volume.extent());
+    let procedure = ProceduralSource::averaged(volume.clone(), acquired, value);
+    block_on(check_reading(&procedure, oracle, 0)).unwrap();
+    let shades = |id| by_definition(&volume, value, id);
+    assert!(block_on(check_reading(&array, shades, 0)).is_err());
 }
 
 #[test]

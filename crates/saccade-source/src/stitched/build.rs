@@ -12,7 +12,7 @@ use futures::future::{join_all, try_join, try_join_all};
 use futures::stream::{self, StreamExt, TryStreamExt};
 use glam::DVec2;
 use saccade_core::levels::Level;
-use saccade_core::volume::{Dtype, Volume};
+use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::oneshot;
 
@@ -22,12 +22,12 @@ use super::canvas::Canvas;
 use super::coverage::{Candidate, Grid, Overlaps, Segment, Uncovered};
 use super::error::StitchError;
 use super::index::IndexedTile;
-use super::resample::{Interpolation, Sample, averaged};
+use super::resample::{Interpolation, Sample};
 use super::tiles::{Image, Tiles};
 use super::{StitchedOptions, StitchedStatistics};
 use crate::ValueRange;
 
-/// Samples per axis that a voxel larger than any pixel is the mean of, at most: 2^4.
+/// Samples per axis that a voxel larger than any pixel is made of, at most: 2^4.
 const FINEST_SAMPLING: u32 = 4;
 /// Sections of a block on which work is under way.
 const SECTIONS_AT_ONCE: usize = 4;
@@ -50,6 +50,52 @@ pub(super) struct Rules {
     pub(super) overlaps: Overlaps,
     along_z: AlongZ,
     gaps: Gaps,
+    /// Whether they are labels, whose 0 is one of them.
+    pub(super) labels: bool,
+}
+
+impl Rules {
+    /// As asked for, but that labels are never mixed: the pixel, tile and section that lie nearest.
+    fn new(options: &StitchedOptions, kind: VoxelKind) -> Self {
+        let asked = Self {
+            interpolation: options.interpolation.unwrap_or_default(),
+            overlaps: options.overlaps,
+            along_z: options.along_z,
+            gaps: options.gaps,
+            labels: kind.is_labels(),
+        };
+        if !asked.labels {
+            return asked;
+        }
+        Self {
+            interpolation: Interpolation::Nearest,
+            overlaps: Overlaps::NearestCentre,
+            along_z: AlongZ::Nearest,
+            gaps: match asked.gaps {
+                Gaps::Linear(most) => Gaps::Nearest(most),
+                gaps => gaps,
+            },
+            labels: true,
+        }
+    }
+
+    /// What was asked for and is not done, in words.
+    pub(super) fn refused(options: &StitchedOptions, kind: VoxelKind) -> Vec<&'static str> {
+        let rules = Self::new(options, kind);
+        let asked = [
+            (
+                "interpolation",
+                options
+                    .interpolation
+                    .is_some_and(|i| i != rules.interpolation),
+            ),
+            ("blending", options.overlaps != rules.overlaps),
+            ("mixing along z", options.along_z != rules.along_z),
+            ("mixing in gaps", options.gaps != rules.gaps),
+        ];
+        let refused = asked.into_iter().filter(|(_, differs)| *differs);
+        refused.map(|(what, _)| what).collect()
+    }
 }
 
 /// Voxels of one channel and level.
@@ -75,15 +121,11 @@ pub(super) struct Part {
 
 impl Builder {
     pub(super) fn new(volume: Arc<Volume>, tiles: Tiles, options: &StitchedOptions) -> Self {
+        let rules = Rules::new(options, volume.kind);
         Self {
             volume,
             tiles: Arc::new(tiles),
-            rules: Rules {
-                interpolation: options.interpolation,
-                overlaps: options.overlaps,
-                along_z: options.along_z,
-                gaps: options.gaps,
-            },
+            rules,
             try_again: options.try_again,
             blocks: AtomicU64::new(0),
             voxels: AtomicU64::new(0),
@@ -255,7 +297,7 @@ impl Builder {
             let opened = near.into_iter().map(async |tile| {
                 let level = grid.level_of(&tile);
                 let image = self.tiles.bounds(&tile, level).await?;
-                Ok(Candidate::new(tile, image, level))
+                Ok(Candidate::new(tile, image, level, self.rules.labels))
             });
             let candidates = try_join_all(opened).await?.into_iter();
             let ranges = candidates.map(|candidate| {
@@ -396,7 +438,9 @@ impl Builder {
             let mut candidates = Vec::new();
             for (tile, (of_pyramid, image)) in near.into_iter().zip(opened) {
                 match image {
-                    Ok(image) => candidates.push(Candidate::new(tile, image, of_pyramid)),
+                    Ok(image) => {
+                        candidates.push(Candidate::new(tile, image, of_pyramid, rules.labels));
+                    }
                     Err(error) => failures.push(Failure::bounds(error, &tile, level, voxels)),
                 }
             }
@@ -419,7 +463,7 @@ impl Builder {
             let (candidate, interpolation) = (&part.candidate, rules.interpolation);
             let wanted = candidate.sub_tiles(&grid, &part.segments, interpolation);
             let fetched = match &candidate.image {
-                Image::Thumbnail(thumbnail) => Ok(thumbnail.fetched(&wanted)),
+                Image::Thumbnail(thumbnail) => Ok(thumbnail.fetched(&wanted, rules.labels)),
                 Image::Pyramid(pyramid) => {
                     let section = candidate.tile.section;
                     { self.tiles.fetch(pyramid, section, candidate.level, wanted) }.await
@@ -431,21 +475,15 @@ impl Builder {
         let tiles = self.tiles.clone();
         let sampled = on_rayon(move || {
             let by = grid.size.x / size.x;
-            let mut canvas = Canvas::<S>::new(grid, rules);
+            let mut canvas = Canvas::<S>::new(grid, by, rules);
             for (part, fetched) in fetched {
                 let drawn = fetched.and_then(|fetched| canvas.draw(&tiles, &part, fetched));
                 if let Err(error) = drawn {
                     failures.push(Failure::segments(error, &part.segments, by));
                 }
             }
-            let values = canvas.finish();
-            let values = if by > 1 {
-                averaged(&values, size, by)
-            } else {
-                values
-            };
             Slice {
-                values: Some(values),
+                values: Some(canvas.finish()),
                 failures,
             }
         });

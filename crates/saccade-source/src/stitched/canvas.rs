@@ -6,29 +6,35 @@ use rayon::prelude::*;
 use super::build::{Part, Rules};
 use super::coverage::{Grid, Overlaps, Segment};
 use super::error::StitchError;
-use super::resample::{Patch, Sample};
+use super::resample::{Patch, Sample, averaged, most_frequent};
 use super::tiles::{Fetched, Tiles};
 
-/// Samples of a grid, 0 where nothing is drawn yet.
+/// Samples of a grid, `by` x `by` of each voxel, 0 where nothing is drawn yet.
 pub(super) struct Canvas<S> {
     grid: Grid,
+    by: u32,
     rules: Rules,
     values: Vec<S>,
+    /// Of labels of which several make a voxel: where a tile is, also one that has 0 there.
+    there: Vec<bool>,
     /// Where tiles are blended: sums of weighted values, and of weights.
     sums: Vec<(f32, f32)>,
 }
 
 impl<S: Sample> Canvas<S> {
-    pub(super) fn new(grid: Grid, rules: Rules) -> Self {
+    pub(super) fn new(grid: Grid, by: u32, rules: Rules) -> Self {
         let samples = grid.size.as_usizevec2().element_product();
+        let votes = rules.labels && by > 1;
         let (values, sums) = match rules.overlaps {
             Overlaps::NearestCentre => (vec![S::default(); samples], Vec::new()),
             Overlaps::Blend => (Vec::new(), vec![(0.0, 0.0); samples]),
         };
         Self {
             grid,
+            by,
             rules,
             values,
+            there: vec![false; if votes { samples } else { 0 }],
             sums,
         }
     }
@@ -55,7 +61,12 @@ impl<S: Sample> Canvas<S> {
             let place = first + segment.start as usize..first + segment.end as usize;
             let pixel = candidate.pixel(&self.grid, segment.start, segment.y);
             let interpolation = self.rules.interpolation;
-            if self.rules.overlaps == Overlaps::NearestCentre {
+            if self.rules.labels {
+                if let Some(there) = self.there.get_mut(place.clone()) {
+                    there.fill(true);
+                }
+                patch.labels(pixel, along, &mut self.values[place]);
+            } else if self.rules.overlaps == Overlaps::NearestCentre {
                 patch.sample(interpolation, pixel, along, &mut self.values[place]);
             } else {
                 row.resize(place.len(), S::default());
@@ -83,9 +94,10 @@ impl<S: Sample> Canvas<S> {
         }
     }
 
-    /// What was drawn.
+    /// The voxels.
     pub(super) fn finish(self) -> Vec<S> {
-        match self.rules.overlaps {
+        let size = self.grid.size / self.by;
+        let samples = match self.rules.overlaps {
             Overlaps::NearestCentre => self.values,
             Overlaps::Blend => {
                 let mean = |(sum, weights): (f32, f32)| match weights {
@@ -94,6 +106,11 @@ impl<S: Sample> Canvas<S> {
                 };
                 self.sums.into_iter().map(mean).collect()
             }
+        };
+        match self.by {
+            1 => samples,
+            by if self.rules.labels => most_frequent(&samples, &self.there, size, by),
+            by => averaged(&samples, size, by),
         }
     }
 }

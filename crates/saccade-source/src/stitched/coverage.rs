@@ -88,12 +88,21 @@ pub(super) struct Candidate {
     pub(super) image: Image,
     /// The level of the pyramid that suits the grid.
     pub(super) level: u32,
+    /// Whether a blank sub-tile says that nothing is there. One of labels says that there is no object, which
+    /// is as much as any other label, and depends on the level.
+    blanks_are_holes: bool,
 }
 
 impl Candidate {
-    /// Of a tile, drawn from an image at a level that suits the grid, see [`Grid::level_of`].
-    pub(super) fn new(tile: Arc<IndexedTile>, image: Image, level: u32) -> Self {
-        Self { tile, image, level }
+    /// Of a tile, of labels or not, drawn from an image at a level that suits the grid, see
+    /// [`Grid::level_of`].
+    pub(super) fn new(tile: Arc<IndexedTile>, image: Image, level: u32, labels: bool) -> Self {
+        Self {
+            tile,
+            image,
+            level,
+            blanks_are_holes: !labels,
+        }
     }
 
     pub(super) fn size(&self) -> PyramidLevel {
@@ -144,7 +153,8 @@ impl Candidate {
         let reach = interpolation.reach();
         let (range, blanks) = self.image.range(self.level, min, max, reach);
         let range = range.map(|range| interpolation.bounds(range));
-        (range, !blanks && corners.into_iter().all(inside))
+        let holes = blanks && self.blanks_are_holes;
+        (range, !holes && corners.into_iter().all(inside))
     }
 
     /// Cuts a row where the tile's pixels are in blank sub-tiles; calls `keep` with the rest.
@@ -155,7 +165,7 @@ impl Candidate {
         row: Range<u32>,
         mut keep: impl FnMut(Range<u32>),
     ) {
-        if !self.image.has_blanks(self.level) {
+        if !(self.blanks_are_holes && self.image.has_blanks(self.level)) {
             return keep(row);
         }
         let mut start = None;

@@ -1,5 +1,6 @@
 //! From decoded sub-tiles to samples.
 
+mod coarse;
 mod float;
 mod line;
 mod sample;
@@ -10,13 +11,14 @@ use bytes::Bytes;
 use glam::{DVec2, UVec2};
 use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE};
 
+pub(super) use coarse::{averaged, most_frequent};
 use line::{Line, MARGIN};
 pub use sample::Sample;
 
 /// What a sample that lies between pixels is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Interpolation {
-    /// The value of the pixel it lies in. For labels, which have no values in between.
+    /// The value of the pixel it lies in, as labels need it: nothing lies between two of them.
     Nearest,
     /// In proportion between the four pixels around it.
     #[default]
@@ -149,33 +151,19 @@ impl<S: Sample> Patch<S> {
     pub fn sample(&self, interpolation: Interpolation, pixel: DVec2, along: DVec2, out: &mut [S]) {
         let line = Line::new(pixel - 0.5 - self.origin, along);
         match interpolation {
-            Interpolation::Nearest => float::nearest(&self.values, self.width, line, out),
+            Interpolation::Nearest => {
+                float::nearest(&self.values, self.width, line, S::of(1), out);
+            }
             Interpolation::Cubic => float::cubic(&self.values, self.width, line, out),
             Interpolation::Linear => S::interpolate(&self.values, self.width, line, out),
         }
     }
-}
 
-/// Each `by` x `by` values become one: the mean of those that are not 0.
-pub(super) fn averaged<S: Sample>(values: &[S], size: UVec2, by: u32) -> Vec<S> {
-    let (width, by) = (size.x as usize * by as usize, by as usize);
-    let mut averaged = Vec::with_capacity(size.x as usize * size.y as usize);
-    let mut sums = vec![(0_u32, 0_u32); size.x as usize];
-    for rows in values.chunks_exact(width * by) {
-        sums.fill((0, 0));
-        for row in rows.chunks_exact(width) {
-            for (values, (sum, count)) in row.chunks_exact(by).zip(&mut sums) {
-                *sum += values.iter().map(|v| u32::from((*v).into())).sum::<u32>();
-                let there = values.iter().filter(|v| **v != S::default());
-                *count += u32::try_from(there.count()).unwrap_or(0);
-            }
-        }
-        averaged.extend(sums.iter().map(|(sum, count)| {
-            let mean = (sum + count / 2).checked_div(*count).unwrap_or(0);
-            S::of(u16::try_from(mean).expect("a mean of 16-bit values has 16 bits"))
-        }));
+    /// The labels of the pixels that samples along a line lie in, as they are, 0 included; see [`Self::sample`].
+    pub(super) fn labels(&self, pixel: DVec2, along: DVec2, out: &mut [S]) {
+        let line = Line::new(pixel - 0.5 - self.origin, along);
+        float::nearest(&self.values, self.width, line, S::default(), out);
     }
-    averaged
 }
 
 #[cfg(test)]
@@ -277,12 +265,5 @@ mod tests {
                 prop_assert!(got.abs_diff(want.round() as u8) <= 1);
             }
         }
-    }
-
-    #[test]
-    fn means_leave_out_what_is_not_there() {
-        let values = [1, 2, 0, 0, 4, 6, 0, 9, 0, 0, 255, 255, 0, 0, 255, 254];
-        assert_eq!(averaged::<u8>(&values, UVec2::new(2, 2), 2), [3, 9, 0, 255]);
-        assert_eq!(averaged(&values, UVec2::new(4, 4), 1), values);
     }
 }

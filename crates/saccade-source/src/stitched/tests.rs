@@ -6,6 +6,7 @@ mod disk;
 mod failures;
 mod fixture;
 mod gaps;
+mod labels;
 mod load;
 mod options;
 mod oracle;

@@ -1,6 +1,7 @@
 //! The coarsest level of a tile's pyramid, which is all that coarse levels of the volume show of it.
 //!
-//! A voxel that is larger than the pixels of a tile's coarsest level is a mean of samples of that level
+//! A voxel that is larger than the pixels of a tile's coarsest level is a mean of samples of that level, or the
+//! most frequent of labels
 //! \[000 §5.2, "Strategy for coarse resolution levels"\]. There the paper keeps the whole coarsest level that is
 //! stitched, and halves it. Here what that level is stitched from is kept: 128 x 128 pixels of each tile
 //! that was seen. Coarse blocks are made of it whichever tile comes or moves, and no pyramid is opened
@@ -54,9 +55,9 @@ impl Thumbnail {
         (!self.is_blank()).then_some((self.min, self.max))
     }
 
-    /// Its sub-tile, as far as it is wanted.
-    pub(super) fn fetched(&self, wanted: &[UVec2]) -> Vec<(UVec2, Fetched)> {
-        let there = wanted.iter().filter(|_| !self.is_blank());
+    /// Its sub-tile, as far as it is wanted; a blank one is left out unless it is of `labels`.
+    pub(super) fn fetched(&self, wanted: &[UVec2], labels: bool) -> Vec<(UVec2, Fetched)> {
+        let there = wanted.iter().filter(|_| labels || !self.is_blank());
         let fetched = there.map(|at| match self.voxels.is_empty() {
             true => (*at, Fetched::Constant(self.min)),
             false => (*at, Fetched::Decoded(self.voxels.clone())),

@@ -14,9 +14,11 @@ use glam::{DVec2, UVec2};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 use saccade_archive::VisualizationArchive;
-use saccade_archive::pyramid::{PyramidIndex, PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS};
+use saccade_archive::pyramid::{
+    PyramidIndex, PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS, SubTileEntry,
+};
 use saccade_archive::storage::Storage;
-use saccade_core::volume::Dtype;
+use saccade_core::volume::{Dtype, Volume};
 use tokio::sync::Semaphore;
 
 /// Reads under way, at most: enough to hide a network's latency, few enough to leave files for others.
@@ -187,6 +189,8 @@ pub(super) struct Tiles {
     storage: Arc<dyn Storage>,
     /// Of the volume.
     dtype: Dtype,
+    /// Whether they are labels.
+    labels: bool,
     reads: Semaphore,
     pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
     sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
@@ -202,7 +206,7 @@ impl Tiles {
     pub(super) fn new(
         archive: &VisualizationArchive,
         index: TileIndex,
-        dtype: Dtype,
+        volume: &Volume,
         disk: Option<(DiskCache, Vec<u8>)>,
         options: &StitchedOptions,
     ) -> Self {
@@ -214,7 +218,8 @@ impl Tiles {
         Self {
             index,
             storage: archive.storage().clone(),
-            dtype,
+            dtype: volume.dtype,
+            labels: volume.kind.is_labels(),
             reads: Semaphore::new(READS_AT_ONCE),
             pyramids: Cache::with_weighter(
                 items(options.index_bytes, 64 << 10),
@@ -341,8 +346,8 @@ impl Tiles {
         Ok(Arc::new(thumbnail))
     }
 
-    /// Fetches sub-tiles of a level, neighbours together. Blank ones are left out; those of one value
-    /// are known without a read.
+    /// Fetches sub-tiles of a level, neighbours together. Blank ones are left out, but for those of labels;
+    /// those of one value are known without a read.
     pub(super) async fn fetch(
         &self,
         pyramid: &Arc<Pyramid>,
@@ -354,7 +359,8 @@ impl Tiles {
         let mut missing = Vec::new();
         for at in wanted {
             let entry = pyramid.index.sub_tile(level as usize, at.x, at.y);
-            if let Some(entry) = entry.filter(|e| e.min == e.max && !e.is_blank()) {
+            let known = |e: &SubTileEntry| e.min == e.max && (self.labels || !e.is_blank());
+            if let Some(entry) = entry.filter(known) {
                 fetched.push((at, Fetched::Constant(entry.min)));
                 continue;
             }

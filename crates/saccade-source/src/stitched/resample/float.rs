@@ -94,11 +94,17 @@ pub(super) fn cubic<S: Arithmetic>(values: &[S], width: usize, mut line: Line, o
     }
 }
 
-/// The pixels that samples lie in.
-pub(super) fn nearest<S: Arithmetic>(values: &[S], width: usize, mut line: Line, out: &mut [S]) {
+/// The pixels that samples lie in, `least` in place of smaller ones.
+pub(super) fn nearest<S: Arithmetic>(
+    values: &[S],
+    width: usize,
+    mut line: Line,
+    least: S,
+    out: &mut [S],
+) {
     for out in out {
         let [x, y] = line.weights().map(|w| usize::from(w >= 1 << 15));
-        *out = values[line.pixel(width) + y * width + x].max(S::of(1));
+        *out = values[line.pixel(width) + y * width + x].max(least);
         line.step(1);
     }
 }

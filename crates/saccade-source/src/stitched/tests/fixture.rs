@@ -7,10 +7,10 @@ use glam::{DVec3, UVec2, UVec3};
 use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::{Catalog, NewTile};
 use saccade_archive::image::Gray;
-use saccade_archive::pyramid::{Encoding, encode};
+use saccade_archive::pyramid::{Encoding, Voxel, encode, encode_labels};
 use saccade_archive::storage::{MemoryStorage, Storage};
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::{Dtype, Volume};
+use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 
 use super::oracle::{How, RawTile, stitch};
@@ -74,14 +74,10 @@ impl Fixture {
         let size = UVec2::new(tile.width as u32, tile.height as u32);
         let pyramid = format!("tiles/{name}-{}.tif", self.changes);
         let bytes = match self.volume.dtype {
-            Dtype::Uint16 => {
-                let image = Gray::new(size.x, size.y, tile.pixels.clone());
-                encode(&image, &Encoding::Lossless).unwrap()
-            }
+            Dtype::Uint16 => encoded(self.volume.kind, size, tile.pixels.clone()),
             _ => {
-                let pixels = tile.pixels.iter().map(|v| *v as u8).collect::<Vec<_>>();
-                let image = Gray::new(size.x, size.y, pixels);
-                encode(&image, &Encoding::Lossless).unwrap()
+                let pixels = tile.pixels.iter().map(|v| *v as u8).collect();
+                encoded::<u8>(self.volume.kind, size, pixels)
             }
         };
         self.storage.write_durable(&pyramid, bytes).await.unwrap();
@@ -153,6 +149,15 @@ impl Fixture {
     pub(super) fn expected(&self) -> Levels {
         expected(&self.volume, &self.tiles)
     }
+}
+
+fn encoded<T: Voxel>(kind: VoxelKind, size: UVec2, pixels: Vec<T>) -> bytes::Bytes {
+    let image = Gray::new(size.x, size.y, pixels);
+    let encoded = match kind {
+        VoxelKind::Intensity => encode(&image, &Encoding::Lossless),
+        VoxelKind::Labels => encode_labels(&image),
+    };
+    encoded.unwrap()
 }
 
 pub(super) fn expected(volume: &Volume, tiles: &BTreeMap<i64, RawTile>) -> Levels {

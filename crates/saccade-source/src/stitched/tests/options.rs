@@ -44,7 +44,7 @@ fn every_choice_equals_brute_force_and_no_other() {
             (StitchedOptions::default(), plain),
             (
                 StitchedOptions {
-                    interpolation: Interpolation::Nearest,
+                    interpolation: Some(Interpolation::Nearest),
                     ..StitchedOptions::default()
                 },
                 How {
@@ -54,7 +54,7 @@ fn every_choice_equals_brute_force_and_no_other() {
             ),
             (
                 StitchedOptions {
-                    interpolation: Interpolation::Cubic,
+                    interpolation: Some(Interpolation::Cubic),
                     ..StitchedOptions::default()
                 },
                 How {
@@ -84,7 +84,7 @@ fn every_choice_equals_brute_force_and_no_other() {
             ),
             (
                 StitchedOptions {
-                    interpolation: Interpolation::Cubic,
+                    interpolation: Some(Interpolation::Cubic),
                     overlaps: Overlaps::Blend,
                     along_z: AlongZ::Linear,
                     ..StitchedOptions::default()
@@ -141,7 +141,7 @@ fn bounds_hold_for_every_choice() {
         ] {
             for overlaps in [Overlaps::NearestCentre, Overlaps::Blend] {
                 let options = StitchedOptions {
-                    interpolation,
+                    interpolation: Some(interpolation),
                     overlaps,
                     along_z: AlongZ::Linear,
                     ..StitchedOptions::default()
@@ -335,7 +335,7 @@ fn sixteen_bits_are_exact() {
             (Interpolation::Cubic, Between::Keys),
         ] {
             let options = StitchedOptions {
-                interpolation,
+                interpolation: Some(interpolation),
                 overlaps: Overlaps::Blend,
                 along_z: AlongZ::Linear,
                 ..StitchedOptions::default()
@@ -347,7 +347,7 @@ fn sixteen_bits_are_exact() {
             };
             for options in [
                 StitchedOptions {
-                    interpolation,
+                    interpolation: Some(interpolation),
                     ..Default::default()
                 },
                 options,
