@@ -49,6 +49,9 @@ pub(crate) struct VolumeDescription {
 pub(crate) struct VolumeDocument {
     name: String,
     dtype: DtypeDocument,
+    /// What values are; where it is missing, shades.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kind: Option<KindDocument>,
     /// Names of the channels.
     channels: Vec<String>,
     /// Voxel size of level 0, x, y, z, in nanometres.
@@ -66,6 +69,14 @@ pub(crate) struct VolumeDocument {
 enum DtypeDocument {
     Uint8,
     Uint16,
+}
+
+/// What values are, if not shades: numbers of objects, which are never mixed.
+#[derive(Debug, PartialEq, Serialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(as = Kind)]
+enum KindDocument {
+    Labels,
 }
 
 /// One resolution of a volume.
@@ -90,6 +101,7 @@ impl From<&Volume> for VolumeDocument {
                 Dtype::Uint16 => DtypeDocument::Uint16,
                 _ => DtypeDocument::Uint8,
             },
+            kind: volume.kind.is_labels().then_some(KindDocument::Labels),
             channels: volume.channels.clone(),
             voxel_nm: volume.voxel_nm.to_array(),
             levels: volume.levels.iter().map(level).collect(),
@@ -172,6 +184,7 @@ pub(crate) struct Document;
 mod tests {
     use super::*;
     use glam::{DVec3, UVec3};
+    use saccade_core::volume::VoxelKind;
     use serde_json::to_value;
 
     /// Saccade's own client reads the types of the core.
@@ -179,8 +192,12 @@ mod tests {
     fn documents_are_the_core_s_types() {
         let mut volume =
             Volume::new("v", UVec3::new(100, 90, 8), DVec3::new(4.0, 4.0, 40.0)).unwrap();
-        for dtype in [Dtype::Uint8, Dtype::Uint16] {
-            volume.dtype = dtype;
+        for (dtype, kind) in [
+            (Dtype::Uint8, VoxelKind::Intensity),
+            (Dtype::Uint16, VoxelKind::Intensity),
+            (Dtype::Uint16, VoxelKind::Labels),
+        ] {
+            (volume.dtype, volume.kind) = (dtype, kind);
             let document = to_value(VolumeDocument::from(&volume)).unwrap();
             assert_eq!(document, to_value(&volume).unwrap());
         }

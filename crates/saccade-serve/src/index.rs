@@ -55,7 +55,7 @@ fn article(volume: &Volume, version: &str, base: &str) -> String {
          {levels} levels</p>\n<p>Open in <a href=\"{open}\">Saccade</a>",
         nm.x, nm.y, nm.z
     );
-    for (viewer, link) in links(&volume.name, version, base) {
+    for (viewer, link) in links(volume, version, base) {
         // Writing to a string cannot fail.
         let _ = write!(html, " · <a href=\"{}\">{viewer}</a>", escaped(&link));
     }
@@ -73,15 +73,27 @@ fn article(volume: &Volume, version: &str, base: &str) -> String {
 }
 
 /// Viewers and the addresses that open a volume in them.
-fn links(name: &str, version: &str, base: &str) -> [(&'static str, String); 3] {
+fn links(volume: &Volume, version: &str, base: &str) -> [(&'static str, String); 3] {
+    let name = &*volume.name;
     // These viewers keep what they have fetched: a new version must have a new address.
     let address = |format: Format| {
         let (name, version) = (encoded(name), encoded(version));
         format!("{base}/v/{name}/at/{version}/{}", format.folder())
     };
     let zarr = address(Format::Zarr3);
+    // Segmentations have no channels, and precomputed says that it has none.
+    let (kind, source) = match volume.kind.is_labels() && volume.channels.len() == 1 {
+        true => {
+            let precomputed = address(Format::Precomputed);
+            (
+                "segmentation",
+                format!("{precomputed}/|neuroglancer-precomputed:"),
+            )
+        }
+        false => ("image", format!("{zarr}/|zarr3:")),
+    };
     let state = json!({
-        "layers": [{ "type": "image", "name": name, "source": format!("{zarr}/|zarr3:") }],
+        "layers": [{ "type": kind, "name": name, "source": source }],
         "selectedLayer": { "layer": name, "visible": true },
         "layout": "4panel",
     });
@@ -136,6 +148,7 @@ fn encoded(text: &str) -> String {
 mod tests {
     use super::*;
     use glam::{DVec3, UVec3};
+    use saccade_core::volume::VoxelKind;
 
     #[test]
     fn names_cannot_leave_their_place() {
@@ -158,10 +171,15 @@ mod tests {
         assert_eq!(base(&request), "http://em.lab:8080");
         request.insert("x-forwarded-proto", "https".parse().unwrap());
         assert_eq!(base(&request), "https://em.lab:8080");
-        let links = links("fly", "ab-7", &base(&request));
-        for (viewer, link) in &links {
+        let mut volume = Volume::new("fly", UVec3::ONE, DVec3::ONE).unwrap();
+        for (viewer, link) in &links(&volume, "ab-7", &base(&request)) {
             let source = encoded("https://em.lab:8080/v/fly/at/ab-7/zarr");
             assert!(link.contains(&source), "{viewer}: {link}");
+        }
+        volume.kind = VoxelKind::Labels;
+        let [(_, neuroglancer), ..] = links(&volume, "ab-7", &base(&request));
+        for part in ["segmentation", "/v/fly/at/ab-7/precomputed/"] {
+            assert!(neuroglancer.contains(&encoded(part)), "{neuroglancer}");
         }
     }
 }

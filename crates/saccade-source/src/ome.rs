@@ -1,8 +1,8 @@
 //! What the metadata of an OME-Zarr image say, the same in versions 0.4 and 0.5: axes, levels and where they
-//! lie, how channels are to be shown.
+//! lie, how channels are to be shown, or that they are labels.
 
 use glam::DVec3;
-use saccade_core::volume::{Dtype, Volume};
+use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use serde_json::{Value, json};
 
 /// The axes of every array, slowest first.
@@ -33,8 +33,21 @@ pub fn placed(volume: &Volume) -> Vec<Placed> {
     placed.collect()
 }
 
-/// The image: axes, and levels whose paths are their numbers.
-pub fn multiscale(name: &str, levels: &[Placed]) -> Value {
+/// The metadata of an image that holds some channels of a volume at some levels; `section` is the one to begin
+/// with. One of labels says so (`image-label`), and has no colours and windows (`omero`), which are for shades.
+pub fn image(volume: &Volume, channels: &[String], levels: &[Placed], section: u32) -> Value {
+    let multiscales = [multiscale(&volume.name, volume.kind, levels)];
+    match volume.kind {
+        VoxelKind::Intensity => json!({
+            "multiscales": multiscales,
+            "omero": omero(channels, volume.dtype, section),
+        }),
+        VoxelKind::Labels => json!({ "multiscales": multiscales, "image-label": {} }),
+    }
+}
+
+/// Axes, and levels whose paths are their numbers.
+fn multiscale(name: &str, kind: VoxelKind, levels: &[Placed]) -> Value {
     let space = |name| json!({ "name": name, "type": "space", "unit": "nanometer" });
     let [c, z, y, x] = AXES;
     let dataset = |(level, placed): (usize, &Placed)| {
@@ -47,14 +60,17 @@ pub fn multiscale(name: &str, levels: &[Placed]) -> Value {
     };
     json!({
         "name": name,
-        "type": "mean",
+        "type": match kind {
+            VoxelKind::Intensity => "mean",
+            VoxelKind::Labels => "mode",
+        },
         "axes": [{ "name": c, "type": "channel" }, space(z), space(y), space(x)],
         "datasets": levels.iter().enumerate().map(dataset).collect::<Vec<_>>(),
     })
 }
 
-/// How channels of these names are to be shown; `section` is the one to begin with.
-pub fn omero(channels: &[String], dtype: Dtype, section: u32) -> Value {
+/// How channels of these names are to be shown.
+fn omero(channels: &[String], dtype: Dtype, section: u32) -> Value {
     let largest = match dtype {
         Dtype::Uint16 => u16::MAX,
         _ => u16::from(u8::MAX),
@@ -100,7 +116,7 @@ mod tests {
     #[test]
     fn levels_lie_on_each_other() {
         let volume = volume();
-        let image = multiscale(&volume.name, &placed(&volume));
+        let image = multiscale(&volume.name, volume.kind, &placed(&volume));
         let datasets = image["datasets"].as_array().unwrap();
         assert_eq!(datasets.len(), volume.levels.len());
         for dataset in datasets {
@@ -127,5 +143,18 @@ mod tests {
         };
         assert_eq!((&a["label"], &b["label"]), (&json!("DAPI"), &json!("GFP")));
         assert_ne!(a["color"], b["color"]);
+    }
+
+    #[test]
+    fn labels_are_said_to_be_labels() {
+        let mut volume = volume();
+        let said = |volume: &Volume| image(volume, &volume.channels, &placed(volume), 0);
+        let shades = said(&volume);
+        assert_eq!(shades["multiscales"][0]["type"], "mean");
+        assert!(shades["omero"].is_object() && shades.get("image-label").is_none());
+        volume.kind = VoxelKind::Labels;
+        let labels = said(&volume);
+        assert_eq!(labels["multiscales"][0]["type"], "mode");
+        assert!(labels["image-label"].is_object() && labels.get("omero").is_none());
     }
 }

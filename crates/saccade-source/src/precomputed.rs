@@ -7,7 +7,8 @@
 //! # Values
 //!
 //! As those of [`crate::zarr`]. Segments whose ids fit into 16 bit keep them; others are scattered over 65535
-//! numbers, which [`PrecomputedSource::notes`] tells: 0 stays nothing, the same id the same number everywhere.
+//! numbers, which [`PrecomputedSource::notes`] tells: 0 stays nothing, the same id the same number everywhere. A volume
+//! of type `segmentation` is one of labels.
 //!
 //! # Failure
 //!
@@ -26,7 +27,7 @@ use std::sync::Arc;
 use glam::{DVec3, UVec3};
 use saccade_core::brick::MAX_LEVELS;
 use saccade_core::levels::Level;
-use saccade_core::volume::{Dtype, MAX_EXTENT, Volume};
+use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
@@ -136,6 +137,9 @@ fn volume(name: &str, info: &Info) -> Result<Volume, Refusal> {
         1 => Dtype::Uint8,
         _ => Dtype::Uint16,
     };
+    if info.is_segmentation && info.number.is_whole() {
+        volume.kind = VoxelKind::Labels;
+    }
     volume.chunk = CHUNK;
     volume.channels = (0..info.channels).map(|n| format!("channel {n}")).collect();
     volume.levels.clear();

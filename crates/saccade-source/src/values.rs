@@ -47,8 +47,9 @@ impl Number {
         }
     }
 
-    fn is_float(self) -> bool {
-        matches!(self, Self::F32 | Self::F64)
+    /// Whether it can be a label.
+    pub(crate) fn is_whole(self) -> bool {
+        !matches!(self, Self::F32 | Self::F64)
     }
 }
 
@@ -96,7 +97,7 @@ impl Values {
     ) -> Self {
         let spread = spread.unwrap_or(Spread { min: 0.0, max: 1.0 });
         let Spread { min, max } = spread;
-        let way = if number.is_float() {
+        let way = if !number.is_whole() {
             let max = if max > min { max } else { min + 1.0 };
             Way::Window(Spread { min, max })
         } else if min >= 0.0 && max <= f64::from(u16::MAX) {

@@ -9,7 +9,8 @@
 //! Unsigned integers of 8 and 16 bit are what they are. Signed ones are moved up by half their range, so that
 //! their order stays. Wider numbers are shown in 16 bit: whole ones as they are if those of the coarsest
 //! level fit, others within a window that [`ZarrSource::notes`] tells. A value of 0 counts as nothing
-//! measured, as everywhere.
+//! measured, as everywhere. An image that says that it is one of labels (`image-label`) is a volume of labels: ids that
+//! do not fit into 16 bit are scattered over 65535 numbers, which the notes tell as well.
 //!
 //! # Reading
 //!
@@ -36,7 +37,7 @@ use futures::future::join_all;
 use glam::{DVec3, UVec3};
 use saccade_core::brick::MAX_LEVELS;
 use saccade_core::levels::Level;
-use saccade_core::volume::{Dtype, MAX_EXTENT, Volume};
+use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 use serde_json::Value;
 
 use crate::maybe_send::{BoxFuture, BoxStream};
@@ -225,6 +226,9 @@ fn volume(name: &str, image: &Image, levels: &[LevelArray]) -> Result<Volume, Re
         1 => Dtype::Uint8,
         _ => Dtype::Uint16,
     };
+    if image.is_labels && finest.number().is_whole() {
+        volume.kind = VoxelKind::Labels;
+    }
     volume.chunk = CHUNK;
     volume.channels = (0..finest.channels())
         .map(|index| match image.channels.get(index as usize) {

@@ -1,10 +1,10 @@
-//! Neuroglancer precomputed: raw, unsharded.
+//! Neuroglancer precomputed: raw, unsharded; labels of one channel as a segmentation, which cannot have more.
 //!
 //! Axes are x, y, z as in the rest of this project, the origin is the corner of voxel 0, so levels
 //! need no translation, and chunks end where the volume does.
 
 use glam::UVec3;
-use saccade_core::volume::{Dtype, Volume};
+use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 use serde_json::{Value, json};
 
@@ -39,9 +39,13 @@ fn info(volume: &Volume) -> Value {
         Dtype::Uint16 => "uint16",
         _ => "uint8",
     };
+    let kind = match (volume.kind, volume.channels.len()) {
+        (VoxelKind::Labels, 1) => "segmentation",
+        _ => "image",
+    };
     json!({
         "@type": "neuroglancer_multiscale_volume",
-        "type": "image",
+        "type": kind,
         "data_type": data_type,
         "num_channels": volume.channels.len(),
         "scales": volume.levels.iter().enumerate().map(scale).collect::<Vec<_>>(),
@@ -146,5 +150,15 @@ mod tests {
                 assert_eq!(number("resolution") % nm, 0.0);
             }
         }
+    }
+
+    #[test]
+    fn labels_of_one_channel_are_a_segmentation() {
+        let mut volume = volume();
+        assert_eq!(info(&volume)["type"], "image");
+        volume.kind = VoxelKind::Labels;
+        assert_eq!(info(&volume)["type"], "segmentation");
+        volume.channels.push("others".to_owned());
+        assert_eq!(info(&volume)["type"], "image", "segmentations have one");
     }
 }

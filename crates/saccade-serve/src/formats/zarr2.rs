@@ -45,11 +45,15 @@ pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
 }
 
 fn group(volume: &Volume) -> Value {
-    let mut multiscale = ome::multiscale(&volume.name, &ome::placed(volume));
-    multiscale["version"] = VERSION.into();
-    let mut omero = ome::omero(&volume.channels, volume.dtype, volume.extent().z / 2);
-    omero["version"] = VERSION.into();
-    json!({ "multiscales": [multiscale], "omero": omero })
+    let section = volume.extent().z / 2;
+    let mut image = ome::image(volume, &volume.channels, &ome::placed(volume), section);
+    image["multiscales"][0]["version"] = VERSION.into();
+    for part in ["omero", "image-label"] {
+        if let Some(part) = image.get_mut(part) {
+            part["version"] = VERSION.into();
+        }
+    }
+    image
 }
 
 fn array(volume: &Volume, level: u32) -> Option<Value> {
@@ -77,23 +81,32 @@ mod tests {
     use super::*;
     use crate::formats::Format;
     use crate::formats::tests::volume;
+    use saccade_core::volume::VoxelKind;
 
     #[test]
     fn it_is_the_image_of_the_newer_version_with_older_names() {
-        fn metadata(format: Format, key: &str) -> Value {
-            match format.entry(&volume(), key) {
+        fn of(volume: &Volume, format: Format, key: &str) -> Value {
+            match format.entry(volume, key) {
                 Ok(Entry::Metadata(metadata)) => metadata,
                 other => panic!("{key}: {other:?}"),
             }
         }
-        let mut older = metadata(Format::Zarr2, ".zattrs");
-        assert_eq!(older["multiscales"][0]["version"].take(), "0.4");
-        assert_eq!(older["omero"]["version"].take(), "0.4");
-        let mut newer = metadata(Format::Zarr3, "zarr.json")["attributes"]["ome"].clone();
-        newer["multiscales"][0]["version"] = Value::Null;
-        newer["omero"]["version"] = Value::Null;
-        newer.as_object_mut().unwrap().remove("version");
-        assert_eq!(older, newer);
+        for (kind, part) in [
+            (VoxelKind::Intensity, "omero"),
+            (VoxelKind::Labels, "image-label"),
+        ] {
+            let mut volume = volume();
+            volume.kind = kind;
+            let mut older = of(&volume, Format::Zarr2, ".zattrs");
+            assert_eq!(older["multiscales"][0]["version"].take(), "0.4");
+            assert_eq!(older[part]["version"].take(), "0.4");
+            let mut newer = of(&volume, Format::Zarr3, "zarr.json")["attributes"]["ome"].clone();
+            newer["multiscales"][0]["version"] = Value::Null;
+            newer[part]["version"] = Value::Null;
+            newer.as_object_mut().unwrap().remove("version");
+            assert_eq!(older, newer);
+        }
+        let metadata = |format, key: &str| of(&volume(), format, key);
         for level in 0..volume().levels.len() {
             let older = metadata(Format::Zarr2, &format!("{level}/.zarray"));
             let newer = metadata(Format::Zarr3, &format!("{level}/zarr.json"));

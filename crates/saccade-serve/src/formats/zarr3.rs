@@ -29,14 +29,13 @@ pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
 }
 
 fn group(volume: &Volume) -> Value {
+    let section = volume.extent().z / 2;
+    let mut image = ome::image(volume, &volume.channels, &ome::placed(volume), section);
+    image["version"] = "0.5".into();
     json!({
         "zarr_format": 3,
         "node_type": "group",
-        "attributes": { "ome": {
-            "version": "0.5",
-            "multiscales": [ome::multiscale(&volume.name, &ome::placed(volume))],
-            "omero": ome::omero(&volume.channels, volume.dtype, volume.extent().z / 2),
-        }},
+        "attributes": { "ome": image },
     })
 }
 

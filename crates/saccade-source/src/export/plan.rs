@@ -150,7 +150,7 @@ impl Plan {
             .levels
             .iter()
             .map(|level| level.extent.to_array());
-        json!({
+        let mut description = json!({
             "volume": self.volume.name,
             "extents": extents.collect::<Vec<_>>(),
             "channels": self.channels,
@@ -158,7 +158,11 @@ impl Plan {
             "min": self.levels[0].voxels.min.to_array(),
             "max": self.levels[0].voxels.max.to_array(),
             "arrays": (0..self.levels.len()).map(|level| self.array(level)).collect::<Vec<_>>(),
-        })
+        });
+        if self.volume.kind.is_labels() {
+            description["labels"] = true.into();
+        }
+        description
     }
 
     /// The image's description: `zarr.json` of the group.
@@ -175,14 +179,13 @@ impl Plan {
         let names = self.channels.iter();
         let names = names.map(|channel| self.volume.channels[*channel as usize].clone());
         let section = self.levels[0].voxels.size().z / 2;
+        let names = names.collect::<Vec<_>>();
+        let mut image = ome::image(&self.volume, &names, &levels, section);
+        image["version"] = "0.5".into();
         json!({
             "zarr_format": 3,
             "node_type": "group",
-            "attributes": { "ome": {
-                "version": "0.5",
-                "multiscales": [ome::multiscale(&self.volume.name, &levels)],
-                "omero": ome::omero(&names.collect::<Vec<_>>(), self.volume.dtype, section),
-            }},
+            "attributes": { "ome": image },
         })
     }
 

@@ -77,6 +77,7 @@ async fn voxels_are_those_that_were_written() {
             "{name}"
         );
         assert_eq!(volume.voxel_nm, DVec3::new(8.0, 8.0, 40.0));
+        assert_eq!(volume.kind.is_labels(), name.starts_with("segments"));
         check_reading(&source, |id| chunk(&volume, id, formula), 0)
             .await
             .unwrap();

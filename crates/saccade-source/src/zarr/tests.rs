@@ -463,6 +463,22 @@ proptest! {
     }
 }
 
+#[test]
+fn labels_are_labels_where_the_image_says_so() {
+    for version in [Version::V2, Version::V3] {
+        for dtype in ["uint8", "uint16"] {
+            let folder = tempfile::tempdir().unwrap();
+            write_image(folder.path(), "zyx", dtype, version);
+            assert!(!open(folder.path()).unwrap().volume().kind.is_labels());
+            let mut labels = attributes("zyx", 2);
+            labels["image-label"] = json!({"version": "0.4"});
+            write_attributes(folder.path(), version, &labels);
+            let kind = open(folder.path()).unwrap().volume().kind;
+            assert!(kind.is_labels(), "{dtype}");
+        }
+    }
+}
+
 /// The same blastocyst by two programs: version 0.1 with blosc, 0.5 in shards. Its level 2 there is every
 /// fourth voxel here, from the fourth on.
 #[test]

@@ -117,11 +117,12 @@ pub(crate) struct Render {
 impl Render {
     pub(crate) async fn run(self) -> Result<()> {
         let transfer = self.transfer_function()?;
-        let source = self
+        let opened = self
             .place
             .open(&self.catalog, self.volume.as_deref(), &self.stitching)
-            .await?
-            .source;
+            .await?;
+        opened.tell_of_labels();
+        let source = opened.source;
         let gpu = Gpu::headless().await?;
         let gpu_bytes = u64::from(self.gpu_memory) << 20;
         let options = SessionOptions {

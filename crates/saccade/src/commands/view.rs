@@ -43,13 +43,15 @@ pub(crate) struct View {
 
 impl View {
     pub(crate) async fn run(self) -> Result<()> {
-        let Opened {
-            source,
-            acquisition,
-        } = self
+        let opened = self
             .place
             .open(&self.catalog, self.volume.as_deref(), &self.stitching)
             .await?;
+        opened.tell_of_labels();
+        let Opened {
+            source,
+            acquisition,
+        } = opened;
         let options = ViewOptions {
             camera: self.camera,
             background: self.background,
