@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::volume::Polarity;
 
 pub use auto::Histogram;
-pub use color_map::ColorMap;
+pub use color_map::{ColorMap, ColorMapError};
 
 /// Entries of the table that the renderer samples.
 pub const TABLE_LEN: usize = 256;

@@ -227,19 +227,12 @@ fn polarity(ui: &mut Ui, transfer: &mut TransferFunction) -> bool {
     transfer.polarity != before
 }
 
-fn map_name(map: ColorMap) -> &'static str {
-    match map {
-        ColorMap::Gray => "Gray",
-        ColorMap::Bone => "Bone",
-        ColorMap::Viridis => "Viridis",
-        ColorMap::Inferno => "Inferno",
-        ColorMap::Green => "Green",
-        ColorMap::Magenta => "Magenta",
-        ColorMap::Cyan => "Cyan",
-        ColorMap::Yellow => "Yellow",
-        ColorMap::Red => "Red",
-        ColorMap::Blue => "Blue",
-    }
+/// As people see it in a menu.
+fn map_name(map: ColorMap) -> String {
+    let name = map.to_string();
+    let mut letters = name.chars();
+    let first = letters.next().map(|first| first.to_ascii_uppercase());
+    first.into_iter().chain(letters).collect()
 }
 
 fn picture(ui: &mut Ui, settings: &mut Settings) {
