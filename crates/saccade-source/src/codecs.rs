@@ -15,9 +15,10 @@ mod zstd;
 use std::io::Read;
 
 use bytes::Bytes;
+use serde::{Deserialize, Serialize};
 
 /// A compression, or a checksum.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Codec {
     /// With a header and a checksum.
     Gzip,

@@ -25,6 +25,7 @@
 mod changes;
 mod codecs;
 pub mod conformance;
+mod decoding;
 #[cfg(not(target_family = "wasm"))]
 pub mod export;
 mod flights;
@@ -42,6 +43,8 @@ mod stored;
 #[cfg(all(test, not(target_family = "wasm")))]
 mod test_server;
 mod values;
+#[cfg(target_family = "wasm")]
+pub mod workers;
 pub mod zarr;
 
 pub use source::{

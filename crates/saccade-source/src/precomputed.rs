@@ -33,6 +33,7 @@ use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
 use crate::stored::{StoredSource, volume_name};
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
+pub(crate) use decode::Packing;
 pub use error::PrecomputedError;
 use error::Refusal;
 use image::PrecomputedImage;

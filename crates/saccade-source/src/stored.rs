@@ -4,12 +4,6 @@
 //! once for all who want it, kept while there is room, and given up when nobody waits any more.
 
 mod piece;
-#[cfg(not(target_family = "wasm"))]
-#[path = "stored/native.rs"]
-mod platform;
-#[cfg(target_family = "wasm")]
-#[path = "stored/wasm.rs"]
-mod platform;
 mod sample;
 
 use std::ops::Range;
@@ -25,7 +19,6 @@ use crate::objects::ObjectError;
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 
 pub(crate) use piece::{Place, copy, fill};
-pub(crate) use platform::compute;
 pub(crate) use sample::{Sample, sampled};
 
 /// Decoded chunks that are kept, all levels together \[bytes\].

@@ -121,13 +121,14 @@ impl TestServer {
     async fn serve(&self, stream: TcpStream) -> std::io::Result<()> {
         let mut stream = BufReader::new(stream);
         loop {
-            let (mut path, mut range) = (String::new(), None);
+            let (mut path, mut range, mut head) = (String::new(), None, false);
             loop {
                 let mut line = String::new();
                 if stream.read_line(&mut line).await? == 0 {
                     return Ok(());
                 }
                 if path.is_empty() {
+                    head = line.starts_with("HEAD ");
                     line.split(' ').nth(1).unwrap_or("").clone_into(&mut path);
                 } else if let Some(value) = line.strip_prefix("range: bytes=") {
                     range = Some(value.trim().to_owned());
@@ -142,7 +143,8 @@ impl TestServer {
             if !latency.is_zero() {
                 tokio::time::sleep(latency).await;
             }
-            let answered = self.answer(&mut stream, &path, range.as_deref()).await;
+            let answered = self.answer(&mut stream, &path, range.as_deref(), head);
+            let answered = answered.await;
             self.busy.fetch_sub(1, Ordering::SeqCst);
             if !answered? {
                 return Ok(());
@@ -165,24 +167,25 @@ impl TestServer {
         stream: &mut BufReader<TcpStream>,
         path: &str,
         range: Option<&str>,
+        head_only: bool,
     ) -> std::io::Result<bool> {
         let fault = self.fault(path);
         if let Some(Fault::Status(status)) = fault {
-            send(stream, status, b"sorry").await?;
+            send(stream, status, b"sorry", head_only).await?;
             return Ok(true);
         }
         let key = path.strip_prefix("/sub/").unwrap_or("").split('?').next();
         let object = self.objects.lock().unwrap().get(key.unwrap_or("")).cloned();
         let Some(object) = object else {
             let missing = *self.missing.lock().unwrap();
-            send(stream, missing, b"no such key").await?;
+            send(stream, missing, b"no such key", head_only).await?;
             return Ok(true);
         };
         let wanted = range.map(|range| bounds(range, object.len()));
         let (mut head, mut body) = match wanted {
             Some(range) if !matches!(fault, Some(Fault::Whole)) => {
                 if range.is_empty() {
-                    send(stream, "416 Range Not Satisfiable", b"").await?;
+                    send(stream, "416 Range Not Satisfiable", b"", head_only).await?;
                     return Ok(true);
                 }
                 let (first, last, length) = (range.start, range.end - 1, object.len());
@@ -248,7 +251,7 @@ impl TestServer {
                 return Ok(false);
             }
         }
-        send(stream, &head, &body).await?;
+        send(stream, &head, &body, head_only).await?;
         Ok(true)
     }
 }
@@ -266,8 +269,14 @@ fn bounds(range: &str, length: usize) -> Range<usize> {
     usize::try_from(bounds.start).unwrap()..usize::try_from(bounds.end).unwrap()
 }
 
-async fn send(stream: &mut BufReader<TcpStream>, head: &str, body: &[u8]) -> std::io::Result<()> {
+async fn send(
+    stream: &mut BufReader<TcpStream>,
+    head: &str,
+    body: &[u8],
+    head_only: bool,
+) -> std::io::Result<()> {
     let head = format!("HTTP/1.1 {head}\r\ncontent-length: {}\r\n\r\n", body.len());
+    let body = if head_only { &[] } else { body };
     stream.write_all(&[head.as_bytes(), body].concat()).await?;
     stream.flush().await
 }

@@ -4,9 +4,10 @@ use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytes::Bytes;
+use serde::{Deserialize, Serialize};
 
 /// How a number is stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Number {
     U8,
     I8,
@@ -54,14 +55,29 @@ impl Number {
 }
 
 /// Smallest and largest of some numbers.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(from = "[u64; 2]", into = "[u64; 2]")]
 pub(crate) struct Spread {
     pub(crate) min: f64,
     pub(crate) max: f64,
 }
 
+/// By their bits: decimal digits may say neighbours.
+impl From<[u64; 2]> for Spread {
+    fn from(bits: [u64; 2]) -> Self {
+        let [min, max] = bits.map(f64::from_bits);
+        Self { min, max }
+    }
+}
+
+impl From<Spread> for [u64; 2] {
+    fn from(Spread { min, max }: Spread) -> Self {
+        [min, max].map(f64::to_bits)
+    }
+}
+
 /// What becomes of numbers that are wider than 16 bit.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 enum Way {
     /// They are what they are; signed ones are moved up by half their range.
     Kept,
@@ -74,11 +90,12 @@ enum Way {
 }
 
 /// To values of a volume, from stored numbers. 0 stays, or becomes, "nothing measured" where it is the least.
-#[derive(Debug)]
+#[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct Values {
     number: Number,
     big_endian: bool,
     way: Way,
+    #[serde(skip)]
     told: AtomicBool,
 }
 

@@ -27,6 +27,7 @@ mod array;
 mod error;
 mod image;
 mod metadata;
+mod packing;
 mod shard;
 #[cfg(all(test, not(target_family = "wasm")))]
 mod tests;
@@ -49,6 +50,7 @@ use error::Refusal;
 pub use error::ZarrError;
 use image::{LevelArray, ZarrImage};
 use metadata::Image;
+pub(crate) use packing::Packing;
 
 /// Size of the chunks that a volume is read in \[voxels\]: some bricks, whatever the file's own are.
 const CHUNK: UVec3 = UVec3::new(64, 64, 64);

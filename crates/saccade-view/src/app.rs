@@ -16,7 +16,7 @@ use crate::acquisition::{Acquisition, AcquisitionReader};
 use crate::facts::{Facts, PageStatus, line};
 use crate::navigate::{Input, moved};
 use crate::options::{ViewOptions, show_channels};
-use crate::panel::{self, Settings};
+use crate::panel::{self, About, Open, Opener, Settings};
 use crate::picture::{Picture, Place};
 use crate::quality::{Cost, Events, Quality};
 use crate::setup::gpu_of;
@@ -37,6 +37,8 @@ pub(crate) struct App {
     quality: Quality,
     cost: Cost,
     acquisition: Acquisition,
+    notes: Vec<String>,
+    opener: Option<Opener>,
     status: Option<Status>,
     preview: bool,
     /// Whether the volume changed since the size of the picture was chosen.
@@ -56,6 +58,10 @@ pub(crate) struct Surroundings {
     pub(crate) lost: Box<dyn Fn()>,
     /// Where the state of the acquisition is asked for.
     pub(crate) acquisition: Option<AcquisitionReader>,
+    /// What the user should know of how values are shown, in sentences.
+    pub(crate) notes: Vec<String>,
+    /// Opens the image at an address instead, where that can be done.
+    pub(crate) open: Option<Open>,
 }
 
 /// Why the application cannot start.
@@ -121,6 +127,8 @@ impl App {
             quality: Quality::new(software),
             cost: Cost::default(),
             acquisition: Acquisition::new(surroundings.acquisition),
+            notes: surroundings.notes,
+            opener: surroundings.open.map(Opener::new),
             status: None,
             preview: false,
             changed: false,
@@ -150,7 +158,17 @@ impl App {
         let mut open = self.panel_open;
         let side = Panel::right("settings").default_size(270.0).min_size(220.0);
         let home = side.show_collapsible(ui, &mut open, |ui| {
-            panel::show(ui, &mut self.session, &mut self.editor, &mut self.settings)
+            let about = About {
+                notes: &self.notes,
+                opener: self.opener.as_mut(),
+            };
+            panel::show(
+                ui,
+                &mut self.session,
+                &mut self.editor,
+                &mut self.settings,
+                about,
+            )
         });
         self.panel_open = open;
         if home.is_some_and(|shown| shown.inner) {

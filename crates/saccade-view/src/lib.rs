@@ -56,4 +56,4 @@ pub use shown::{
 #[cfg(not(target_family = "wasm"))]
 pub use native::{SourceSpec, ViewError, run};
 #[cfg(target_family = "wasm")]
-pub use web::{start, status};
+pub use web::{decode, decoders, prepare_decoder, start, status};

@@ -103,6 +103,9 @@ pub async fn run(spec: SourceSpec, options: ViewOptions) -> Result<(), ViewError
                 close.send_viewport_cmd(egui::ViewportCommand::Close);
             }),
             acquisition,
+            // Whoever opened the image has told them.
+            notes: Vec::new(),
+            open: None,
         };
         let app = App::new(context, source, options, surroundings)?;
         Ok(Box::new(app) as Box<dyn eframe::App>)

@@ -2,6 +2,7 @@
 
 use saccade_core::camera::{Camera, ParseCameraError};
 use saccade_core::transfer::TransferFunction;
+use saccade_source::objects::{Location, LocationError};
 
 use crate::options::{BackgroundError, ViewOptions, background_from_text};
 use crate::shown::{
@@ -13,6 +14,8 @@ use crate::shown::{
 pub struct PageOptions {
     /// Volume to open; the server's first otherwise.
     pub volume: Option<String>,
+    /// Address of an image that somebody else wrote, to open instead.
+    pub source: Option<String>,
     /// What the application opens with.
     pub view: ViewOptions,
 }
@@ -30,6 +33,12 @@ pub enum PageError {
     /// `channels=`, `mode=`, `clip=` or `slice=`.
     #[error(transparent)]
     Shown(#[from] ShownError),
+    /// `source=`.
+    #[error(transparent)]
+    Source(#[from] LocationError),
+    /// `source=` and `volume=`.
+    #[error("source= names an image and volume= one of the server's volumes; give one of them")]
+    Both,
     /// `transfer=`.
     #[error("transfer= is no transfer function as JSON")]
     Transfer {
@@ -58,6 +67,7 @@ impl PageOptions {
         for (name, value) in pairs {
             match name.as_str() {
                 "volume" => page.volume = Some(value),
+                "source" => page.source = Some(value),
                 "camera" => page.view.camera = Some(value.parse::<Camera>()?),
                 "transfer" => {
                     page.view.transfer = Some(serde_json::from_str::<TransferFunction>(&value)?);
@@ -71,7 +81,28 @@ impl PageOptions {
                 _ => {}
             }
         }
+        if page.source.is_some() && page.volume.is_some() {
+            return Err(PageError::Both);
+        }
         Ok(page)
+    }
+
+    /// Where the image is that is asked for, if one is. An address that begins with `/` is of the host that the page
+    /// is of, whose `origin` is such as `http://localhost:8080`.
+    ///
+    /// # Errors
+    ///
+    /// [`PageError::Source`] if that is no address.
+    pub fn image(&self, origin: &str) -> Result<Option<Location>, PageError> {
+        let Some(source) = &self.source else {
+            return Ok(None);
+        };
+        let source = source.trim();
+        let address = match source.strip_prefix('/') {
+            Some(path) => format!("{origin}/{path}"),
+            None => source.to_owned(),
+        };
+        Ok(Some(address.parse()?))
     }
 }
 
@@ -118,7 +149,7 @@ mod tests {
             ("slice", "x=3"),
             ("ui", "off"),
         ]);
-        let PageOptions { volume, view } = page.unwrap();
+        let PageOptions { volume, view, .. } = page.unwrap();
         assert_eq!(volume.as_deref(), Some("my brain"));
         assert_eq!(view.camera.unwrap().distance_nm, 1000.0);
         assert_eq!(view.transfer, Some(transfer));
@@ -135,6 +166,32 @@ mod tests {
             }
         );
         assert!(!view.ui);
+    }
+
+    #[test]
+    fn images_are_named_by_addresses() {
+        let image = |source: &str| {
+            let page = page(&[("source", source)]).unwrap();
+            page.image("http://localhost:8080")
+        };
+        for (source, place) in [
+            ("https://host/a/b.zarr", "https://host/a/b.zarr"),
+            ("/v/em/zarr", "http://localhost:8080/v/em/zarr"),
+            (
+                "precomputed://gs://bucket/em",
+                "https://storage.googleapis.com/bucket/em",
+            ),
+        ] {
+            let got = image(source).unwrap().unwrap();
+            assert_eq!(got.to_string(), place);
+        }
+        assert!(matches!(
+            image("ftp://host/b.zarr"),
+            Err(PageError::Source(_))
+        ));
+        assert_eq!(page(&[]).unwrap().image("http://h").unwrap(), None);
+        let both = page(&[("source", "/a"), ("volume", "b")]);
+        assert!(matches!(both, Err(PageError::Both)));
     }
 
     #[test]

@@ -24,16 +24,64 @@ pub(crate) struct Settings {
     pub(crate) selected: u32,
 }
 
+/// Opens the image at an address.
+pub(crate) type Open = Box<dyn Fn(&str)>;
+
+/// Where the user types an address.
+pub(crate) struct Opener {
+    address: String,
+    open: Open,
+}
+
+impl Opener {
+    pub(crate) fn new(open: Open) -> Self {
+        let address = String::new();
+        Self { address, open }
+    }
+
+    fn show(&mut self, ui: &mut Ui) {
+        ui.collapsing("Open an image", |ui| {
+            let hint = "https://host/image.zarr";
+            let field = egui::TextEdit::singleline(&mut self.address).hint_text(hint);
+            let field = ui.add(field.desired_width(f32::INFINITY));
+            let entered = field.lost_focus() && ui.input(|i| i.key_pressed(egui::Key::Enter));
+            let named = !self.address.trim().is_empty();
+            let button = ui.add_enabled(named, egui::Button::new("Open"));
+            let button = button.on_hover_text(
+                "An OME-Zarr image or a Neuroglancer precomputed volume, read by this page itself",
+            );
+            if named && (entered || button.clicked()) {
+                (self.open)(&self.address);
+            }
+        });
+    }
+}
+
+/// What the panel tells of the volume, and how another is opened.
+pub(crate) struct About<'a> {
+    /// What the user should know of how values are shown, in sentences.
+    pub(crate) notes: &'a [String],
+    /// Where another image can be opened.
+    pub(crate) opener: Option<&'a mut Opener>,
+}
+
 /// Shows the panel and applies what the user does in it. Whether the camera is to go home.
 pub(crate) fn show(
     ui: &mut Ui,
     session: &mut Session,
     editor: &mut TransferEditor,
     settings: &mut Settings,
+    about: About<'_>,
 ) -> bool {
     egui::ScrollArea::vertical()
         .show(ui, |ui| {
             describe(ui, &session.volume().clone());
+            for note in about.notes {
+                ui.weak(note);
+            }
+            if let Some(opener) = about.opener {
+                opener.show(ui);
+            }
             ui.separator();
             if session.channels().len() > 1 {
                 channels(ui, session, &mut settings.selected);

@@ -3,15 +3,19 @@
 use std::cell::RefCell;
 use std::sync::Arc;
 
-use saccade_source::VolumeSource;
+use saccade_source::objects::Location;
 use saccade_source::remote::{RemoteSource, volumes};
+use saccade_source::{VolumeSource, images, workers};
 use wasm_bindgen::prelude::{JsCast, JsValue, wasm_bindgen};
 use web_sys::HtmlCanvasElement;
 
-use crate::acquisition::from_server;
+use crate::acquisition::{AcquisitionReader, from_server};
 use crate::app::{App, Surroundings};
 use crate::page::PageOptions;
 use crate::setup::wgpu_options;
+
+/// Script of workers that decode, beside the page.
+const DECODER: &str = "decoder.js";
 
 thread_local! {
     static STATUS: RefCell<String> = const { RefCell::new(String::new()) };
@@ -26,6 +30,7 @@ thread_local! {
 pub async fn start(canvas_id: String) -> Result<(), JsValue> {
     console_error_panic_hook::set_once();
     eframe::WebLogger::init(log::LevelFilter::Warn).ok();
+    workers::use_workers(DECODER);
     run(&canvas_id)
         .await
         .map_err(|message| JsValue::from_str(&message))
@@ -35,6 +40,29 @@ pub async fn start(canvas_id: String) -> Result<(), JsValue> {
 #[wasm_bindgen]
 pub fn status() -> String {
     STATUS.with_borrow(String::clone)
+}
+
+/// What was decoded where, as JSON: see [`workers::Counts`].
+#[wasm_bindgen]
+pub fn decoders() -> String {
+    serde_json::to_string(&workers::counts()).unwrap_or_default()
+}
+
+/// Makes this instance a worker's: what goes wrong is said on the console.
+#[wasm_bindgen]
+pub fn prepare_decoder() {
+    console_error_panic_hook::set_once();
+    eframe::WebLogger::init(log::LevelFilter::Warn).ok();
+}
+
+/// A worker's part: decodes a chunk.
+///
+/// # Errors
+///
+/// A string: what is wrong with the chunk.
+#[wasm_bindgen]
+pub fn decode(task: &str, bytes: Vec<u8>) -> Result<Vec<u8>, JsValue> {
+    workers::work(task, bytes).map_err(|damage| JsValue::from_str(&damage))
 }
 
 async fn run(canvas_id: &str) -> Result<(), String> {
@@ -49,26 +77,10 @@ async fn run(canvas_id: &str) -> Result<(), String> {
         .and_then(|element| element.dyn_into::<HtmlCanvasElement>().ok())
         .ok_or_else(|| format!("the page has no canvas {canvas_id:?}"))?;
 
-    let name = match page.volume {
-        Some(name) => name,
-        None => {
-            let names = volumes(&origin).await.map_err(|error| in_words(&error))?;
-            names
-                .into_iter()
-                .next()
-                .ok_or("The server offers no volumes yet.")?
-        }
+    let opened = match page.image(&origin).map_err(|error| in_words(&error))? {
+        Some(image) => open_image(&image).await?,
+        None => open_volume(&origin, page.volume).await?,
     };
-    let source = RemoteSource::open(&origin, &name)
-        .await
-        .map_err(|error| in_words(&error))?;
-    let acquisition = from_server(source.status_reader());
-    // Shared within this thread only: browsers have no other.
-    #[expect(
-        clippy::arc_with_non_send_sync,
-        reason = "sources are shared by Arc natively"
-    )]
-    let source: Arc<dyn VolumeSource> = Arc::new(source);
 
     let options = eframe::WebOptions {
         wgpu_options: wgpu_options(),
@@ -78,9 +90,11 @@ async fn run(canvas_id: &str) -> Result<(), String> {
     let surroundings = Surroundings {
         publish: Box::new(|json| STATUS.set(json)),
         lost: Box::new(tell_lost),
-        acquisition: Some(acquisition),
+        acquisition: opened.acquisition,
+        notes: opened.notes,
+        open: Some(Box::new(go_to_image)),
     };
-    let view = page.view;
+    let (view, source) = (page.view, opened.source);
     let create = Box::new(move |context: &eframe::CreationContext<'_>| {
         let app = App::new(context, source, view, surroundings)?;
         Ok(Box::new(app) as Box<dyn eframe::App>)
@@ -93,12 +107,69 @@ async fn run(canvas_id: &str) -> Result<(), String> {
     Ok(())
 }
 
+/// What the page shows.
+struct Opened {
+    source: Arc<dyn VolumeSource>,
+    acquisition: Option<AcquisitionReader>,
+    /// What the user should know of it.
+    notes: Vec<String>,
+}
+
+/// An image that somebody else wrote, read by this page itself.
+async fn open_image(location: &Location) -> Result<Opened, String> {
+    let image = images::open(location).await;
+    let image =
+        image.map_err(|error| format!("The image cannot be opened: {}", in_words(&error)))?;
+    Ok(Opened {
+        source: image.source,
+        acquisition: None,
+        notes: image.notes,
+    })
+}
+
+/// A volume of the server that the page is of; its first if none is named.
+async fn open_volume(origin: &str, name: Option<String>) -> Result<Opened, String> {
+    let name = match name {
+        Some(name) => name,
+        None => {
+            let names = volumes(origin).await.map_err(|error| in_words(&error))?;
+            let first = names.into_iter().next();
+            first.ok_or("The server offers no volumes yet.")?
+        }
+    };
+    let source = RemoteSource::open(origin, &name).await;
+    let source = source.map_err(|error| in_words(&error))?;
+    let acquisition = from_server(source.status_reader());
+    // Shared within this thread only: browsers have no other.
+    #[expect(
+        clippy::arc_with_non_send_sync,
+        reason = "sources are shared by Arc natively"
+    )]
+    let source: Arc<dyn VolumeSource> = Arc::new(source);
+    Ok(Opened {
+        source,
+        acquisition: Some(acquisition),
+        notes: Vec::new(),
+    })
+}
+
+/// Opens the page anew, on an image.
+fn go_to_image(address: &str) {
+    let source = js_sys::encode_uri_component(address.trim());
+    let moved =
+        web_sys::window().map(|window| window.location().set_search(&format!("source={source}")));
+    if !matches!(moved, Some(Ok(()))) {
+        log::error!("the page cannot be sent to {address}");
+    }
+}
+
 fn page_options(search: &str) -> Result<PageOptions, String> {
     let query = search.trim_start_matches('?');
     let parameters =
         web_sys::UrlSearchParams::new_with_str(query).map_err(|error| format!("{error:?}"))?;
     let names = [
         "volume",
+        "source",
         "camera",
         "channels",
         "transfer",

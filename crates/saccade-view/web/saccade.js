@@ -1,10 +1,11 @@
 // Starts the application, and says in plain words why it cannot start.
-import init, { start, status } from "./saccade_view.js";
+import init, { decoders, start, status } from "./saccade_view.js";
 
 const message = document.getElementById("message");
+const form = document.getElementById("open");
 
 function fail(text) {
-  message.textContent = text;
+  document.getElementById("words").textContent = text;
   message.className = "error";
   message.hidden = false;
   window.saccade.error = text;
@@ -19,6 +20,8 @@ window.saccade = {
     const json = loaded ? status() : "";
     return json ? JSON.parse(json) : null;
   },
+  // How many chunks workers decoded, and how many this page.
+  decoders: () => (loaded ? JSON.parse(decoders()) : null),
 };
 
 window.saccadeLost = () =>
@@ -48,6 +51,9 @@ async function main() {
   } catch (error) {
     console.error(error);
     fail(`Saccade could not start.\n\n${error instanceof Error ? error.message : error}`);
+    // What was asked for may be what is wrong.
+    form.elements.source.value = new URLSearchParams(location.search).get("source") ?? "";
+    form.hidden = false;
   }
 }
 

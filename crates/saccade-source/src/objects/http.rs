@@ -10,6 +10,8 @@ mod platform;
 #[cfg(all(test, not(target_family = "wasm")))]
 mod tests;
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use bytes::Bytes;
 use reqwest::{Client, StatusCode, Url, header};
 use tokio::sync::{OnceCell, Semaphore};
@@ -33,11 +35,21 @@ const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
 /// again, see [`Patience`]. A server that ignores ranges is put up with, and told of.
 ///
 /// Natively, redirections to other hosts are not followed: whoever runs a store cannot make this computer ask others.
+///
+/// # In browsers
+///
+/// A page reads from another host only what that host lets it (CORS); what it does not let through looks like no
+/// answer at all. The error tells the two apart, and says which headers the server should send. An object's
+/// end is asked for by its length, since browsers ask for permission before they ask for "the last bytes".
 #[derive(Debug)]
 pub struct HttpObjects {
     client: Client,
     base: Url,
     patience: Patience,
+    /// Whether the ends of objects can be asked for without knowing their lengths.
+    suffixes: bool,
+    /// Whether any answer could be read so far.
+    heard: AtomicBool,
     requests: Semaphore,
     /// Whether missing objects are forbidden here, once it was asked.
     forbids_missing: OnceCell<bool>,
@@ -69,6 +81,8 @@ impl HttpObjects {
             client: platform::client(),
             base: url,
             patience,
+            suffixes: platform::SUFFIXES,
+            heard: AtomicBool::new(false),
             requests: Semaphore::new(REQUESTS),
             forbids_missing: OnceCell::new(),
         })
@@ -95,6 +109,15 @@ impl HttpObjects {
             return Ok(Some(Bytes::new()));
         }
         let url = self.url(key);
+        let part = match part {
+            Part::Last(count) if !self.suffixes => match self.length(key, &url).await? {
+                Some(Some(0)) => return Ok(Some(Bytes::new())),
+                Some(Some(length)) => Part::Range(length.saturating_sub(count)..length),
+                Some(None) => part,
+                None => return Ok(None),
+            },
+            part => part,
+        };
         let asked = self
             .patience
             .attempts(self, key, || self.attempt(&url, &part));
@@ -107,6 +130,27 @@ impl HttpObjects {
                 location: shown(&url),
             }),
         }
+    }
+
+    /// The length of an object, if its server tells; `None` if there is no such object.
+    async fn length(&self, key: &str, url: &Url) -> Result<Option<Option<u64>>, ObjectError> {
+        let ask = || async {
+            let _permit = self.requests.acquire().await.ok();
+            let answer = self.send(self.client.head(url.clone()), url).await?;
+            Ok(match answer.status() {
+                StatusCode::OK => {
+                    let encoded = answer.headers().contains_key(header::CONTENT_ENCODING);
+                    let length = answer.headers().get(header::CONTENT_LENGTH);
+                    let length = length.and_then(|length| length.to_str().ok()?.parse().ok());
+                    Some(length.filter(|_| !encoded))
+                }
+                StatusCode::NOT_FOUND | StatusCode::GONE => None,
+                status if is_passing(status) => return Err(again(&answer)),
+                // Not every server knows this question.
+                _ => Some(None),
+            })
+        };
+        self.patience.attempts(self, key, ask).await
     }
 
     /// Asks, once, for an object that there cannot be.
@@ -129,6 +173,23 @@ impl HttpObjects {
         self.forbids_missing.get_or_try_init(ask).await.copied()
     }
 
+    async fn send(
+        &self,
+        request: reqwest::RequestBuilder,
+        url: &Url,
+    ) -> Result<reqwest::Response, Failure> {
+        let heard = &self.heard;
+        match self.patience.idle(request.send()).await? {
+            Ok(answer) => {
+                heard.store(true, Ordering::Relaxed);
+                Ok(answer)
+            }
+            Err(error) => {
+                Err(platform::unanswered(error, &shown(url), heard.load(Ordering::Relaxed)).await)
+            }
+        }
+    }
+
     async fn attempt(&self, url: &Url, part: &Part) -> Result<Found, Failure> {
         // The semaphore is never closed.
         let _permit = self.requests.acquire().await.ok();
@@ -143,8 +204,7 @@ impl HttpObjects {
                 request = request.header(header::RANGE, format!("bytes=-{count}"));
             }
         }
-        let sent = self.patience.idle(request.send()).await?;
-        let answer = sent.map_err(|error| Failure::again(chain(&error.without_url())))?;
+        let answer = self.send(request, url).await?;
         let status = answer.status();
         match status {
             StatusCode::OK | StatusCode::PARTIAL_CONTENT => {
@@ -161,10 +221,7 @@ impl HttpObjects {
                 // The end of an empty object.
                 _ => Ok(Found::Object(Bytes::new())),
             },
-            StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS => Err(again(&answer)),
-            _ if status.is_server_error() && status != StatusCode::NOT_IMPLEMENTED => {
-                Err(again(&answer))
-            }
+            _ if is_passing(status) => Err(again(&answer)),
             _ if status.is_redirection() => {
                 let to = answer.headers().get(header::LOCATION);
                 let to = to.and_then(|to| to.to_str().ok()).unwrap_or("nowhere");
@@ -205,6 +262,14 @@ enum Found {
     Object(Bytes),
     Nothing,
     Forbidden,
+}
+
+/// Whether the same question may be answered better later.
+fn is_passing(status: StatusCode) -> bool {
+    matches!(
+        status,
+        StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS
+    ) || (status.is_server_error() && status != StatusCode::NOT_IMPLEMENTED)
 }
 
 fn again(answer: &reqwest::Response) -> Failure {

@@ -7,13 +7,33 @@ use glam::UVec3;
 use image::codecs::jpeg::JpegDecoder;
 use image::codecs::png::PngDecoder;
 use image::{ExtendedColorType, ImageDecoder};
+use serde::{Deserialize, Serialize};
 
 use super::info::Encoding;
 use crate::codecs::{Codec, Damage};
 use crate::values::Number;
 
+/// What was done with the numbers of a chunk.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Packing {
+    pub(super) encoding: Encoding,
+    pub(super) shape: Shape,
+    /// Whether they were compressed by gzip once more, and what may come out of that \[bytes\].
+    pub(super) zipped: Option<usize>,
+}
+
+impl Packing {
+    /// Numbers in the order x, y, z, channel, the first fastest, little-endian.
+    pub(crate) fn unpack(&self, mut bytes: Bytes) -> Result<Bytes, Damage> {
+        if let Some(most) = self.zipped {
+            bytes = Codec::Gzip.decode(bytes, most)?;
+        }
+        decode(self.encoding, self.shape, bytes)
+    }
+}
+
 /// What a chunk should hold.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Shape {
     /// \[voxels\]
     pub(super) size: UVec3,
@@ -32,8 +52,7 @@ impl Shape {
     }
 }
 
-/// Numbers in the order x, y, z, channel, the first fastest, little-endian.
-pub(super) fn decode(encoding: Encoding, shape: Shape, mut bytes: Bytes) -> Result<Bytes, Damage> {
+fn decode(encoding: Encoding, shape: Shape, mut bytes: Bytes) -> Result<Bytes, Damage> {
     let want = shape.bytes();
     // Stores that compress in transport are copied to folders as they are.
     let zipped = bytes.starts_with(&[0x1f, 0x8b, 8]);

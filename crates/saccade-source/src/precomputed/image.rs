@@ -10,14 +10,15 @@ use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
-use super::decode::{Shape, decode};
+use super::decode::{Packing, Shape};
 use super::info::{Info, Scale, Sharding};
 use super::shard::{Index, Minishard, compressed_morton, index_range};
-use crate::codecs::{Codec, Damage};
+use crate::codecs::Damage;
+use crate::decoding::{self, Decoding, decode};
 use crate::flights::{Flights, Work};
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, compute, sampled,
+    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, sampled,
 };
 use crate::values::Values;
 
@@ -152,28 +153,17 @@ impl PrecomputedImage {
         values: Option<&Arc<Values>>,
     ) -> Raw {
         let scale = self.scale(id.level);
-        let shape = self.shape(self.chunk(id).1.size());
-        let encoding = scale.encoding;
         let zipped = scale.sharding.is_some_and(|sharding| sharding.data_gzip);
-        let most = self.most_encoded(scale);
+        let most = usize::try_from(self.most_encoded(scale)).unwrap_or(usize::MAX);
+        let packing = Packing {
+            encoding: scale.encoding,
+            shape: self.shape(self.chunk(id).1.size()),
+            zipped: zipped.then_some(most),
+        };
+        let decoding = Decoding::new(decoding::Packing::Precomputed(packing), values);
         let mut again = self.objects.is_remote();
         loop {
-            let values = values.cloned();
-            let done = compute(move || {
-                if zipped {
-                    bytes =
-                        Codec::Gzip.decode(bytes, usize::try_from(most).unwrap_or(usize::MAX))?;
-                }
-                let decoded = decode(encoding, shape, bytes)?;
-                Ok(match values {
-                    Some(values) => values.convert(decoded),
-                    None => decoded,
-                })
-            });
-            let done = done
-                .await
-                .unwrap_or_else(|| Err("decoding it was interrupted".to_owned()));
-            match done {
+            match decode(decoding.clone(), bytes).await {
                 Ok(decoded) => return Ok(Some(decoded)),
                 Err(_) if again => again = false,
                 Err(damage) => return Err(self.damaged(id, key, damage)),

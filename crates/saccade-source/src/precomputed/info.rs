@@ -1,6 +1,7 @@
 //! What an `info` says of its volume.
 
 use glam::{DVec3, UVec3};
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::error::Refusal;
@@ -38,7 +39,7 @@ pub(super) struct Scale {
 }
 
 /// How a chunk's numbers become bytes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Encoding {
     Raw,
     Jpeg,

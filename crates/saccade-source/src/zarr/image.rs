@@ -13,12 +13,14 @@ use saccade_core::voxel_box::VoxelBox;
 use super::array::Array;
 use super::error::{Refusal, ZarrError};
 use super::metadata::{Axis, Image};
+use super::packing::Packing;
 use super::shard::Index;
 use crate::codecs::Damage;
+use crate::decoding::{self, Decoding, decode};
 use crate::flights::{Flights, Work};
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, compute, sampled,
+    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, sampled,
 };
 use crate::values::{Number, Values};
 
@@ -32,6 +34,7 @@ const RANGES_AT_ONCE: usize = 8;
 pub(super) struct LevelArray {
     path: String,
     array: Arc<Array>,
+    packing: Packing,
     axes: Vec<Axis>,
     grid: Vec<u64>,
     extent: UVec3,
@@ -68,6 +71,7 @@ impl LevelArray {
         Ok(Self {
             path: path.to_owned(),
             grid: array.grid(),
+            packing: Packing::new(array.encoding.codecs.clone(), array.chunk_bytes()),
             array: Arc::new(array),
             axes: axes.to_vec(),
             extent,
@@ -297,21 +301,11 @@ impl ZarrImage {
         mut bytes: Bytes,
         values: Option<&Arc<Values>>,
     ) -> Raw {
-        let array = &self.levels[id.level as usize].array;
+        let packing = &self.levels[id.level as usize].packing;
+        let decoding = Decoding::new(decoding::Packing::Zarr(packing.clone()), values);
         let mut again = self.objects.is_remote();
         loop {
-            let (array, values) = (array.clone(), values.cloned());
-            let done = compute(move || {
-                let decoded = decode(&array, bytes)?;
-                Ok(match values {
-                    Some(values) => values.convert(decoded),
-                    None => decoded,
-                })
-            });
-            let done = done
-                .await
-                .unwrap_or_else(|| Err("decoding it was interrupted".to_owned()));
-            match done {
+            match decode(decoding.clone(), bytes).await {
                 Ok(decoded) => return Ok(Some(decoded)),
                 Err(_) if again => again = false,
                 Err(damage) => return Err(self.damaged(id, key, damage)),
@@ -332,7 +326,7 @@ impl ZarrImage {
         values: Option<&Arc<Values>>,
     ) -> Vec<(PieceId, Raw)> {
         let array = &self.levels[level as usize];
-        let most = most_encoded(&array.array);
+        let most = array.packing.most();
         let Some(sharding) = &array.array.sharding else {
             let one = async |id: PieceId| {
                 let index = unravel(id.number, &array.grid);
@@ -473,32 +467,6 @@ impl ZarrImage {
         };
         let mut found = self.indices.get(&[id], start).await;
         found.pop().flatten().unwrap_or(Ok(None))
-    }
-}
-
-/// Longest that an encoded chunk can sensibly be \[bytes\].
-fn most_encoded(array: &Array) -> u64 {
-    let decoded = array.chunk_bytes() as u64;
-    decoded + decoded / 8 + (64 << 10)
-}
-
-/// Numbers as they are stored, from the bytes of a chunk.
-fn decode(array: &Array, mut bytes: Bytes) -> Result<Bytes, Damage> {
-    let want = array.chunk_bytes();
-    for (n, codec) in array.encoding.codecs.iter().enumerate().rev() {
-        let most = match n {
-            0 => want,
-            _ => usize::try_from(most_encoded(array)).unwrap_or(usize::MAX),
-        };
-        bytes = codec.decode(bytes, most)?;
-    }
-    if bytes.len() == want {
-        Ok(bytes)
-    } else {
-        Err(format!(
-            "it has {} bytes of voxels instead of {want}",
-            bytes.len()
-        ))
     }
 }
 

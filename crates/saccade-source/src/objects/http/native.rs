@@ -1,6 +1,12 @@
 use reqwest::Client;
 use reqwest::redirect::{Attempt, Policy};
 
+use super::chain;
+use crate::objects::error::Failure;
+
+/// The last bytes can be asked for as such.
+pub(super) const SUFFIXES: bool = true;
+
 /// Follows a server to another place of its own, not to others.
 pub(super) fn client() -> Client {
     saccade_archive::tls::provide();
@@ -19,4 +25,9 @@ pub(super) fn client() -> Client {
     };
     let client = Client::builder().redirect(Policy::custom(own));
     client.build().unwrap_or_default()
+}
+
+/// What it means that no answer came.
+pub(super) async fn unanswered(error: reqwest::Error, _: &str, _: bool) -> Failure {
+    Failure::again(chain(&error.without_url()))
 }

@@ -54,6 +54,34 @@ async fn ignored_ranges_conform() {
     conformance::check(&of(&server)).await;
 }
 
+/// As browsers do, to whom "the last bytes" are a question that needs permission.
+#[tokio::test]
+async fn ends_that_are_asked_for_by_length_conform() {
+    let by_length = |server: &TestServer| HttpObjects {
+        suffixes: false,
+        ..of(server)
+    };
+    let server = TestServer::start(conformance::objects()).await;
+    conformance::check(&by_length(&server)).await;
+    let log = server.log.lock().unwrap().clone();
+    let of_an_end = |range: &str| range.starts_with('-');
+    let ranges: Vec<_> = log.into_iter().filter_map(|(_, range)| range).collect();
+    assert!(
+        !ranges.is_empty() && !ranges.iter().any(|range| of_an_end(range)),
+        "{ranges:?}"
+    );
+    // What does not know the question is asked the other one, and what passes is asked again.
+    server.fail_next([
+        Fault::Status("405 Method Not Allowed"),
+        Fault::Status("503 Slow Down"),
+    ]);
+    let end = by_length(&server).read("a/b/ten", Part::Last(3)).await;
+    assert_eq!(end.unwrap().as_deref(), Some(&b"789"[..]));
+    server.fail_next([Fault::Status("503 Slow Down")]);
+    let end = by_length(&server).read("a/b/ten", Part::Last(3)).await;
+    assert_eq!(end.unwrap().as_deref(), Some(&b"789"[..]));
+}
+
 async fn ten(store: &dyn Objects) -> Result<Option<Bytes>, ObjectError> {
     store.read("a/b/ten", Part::Range(2..8)).await
 }
@@ -153,7 +181,7 @@ async fn requests_are_limited_and_end_with_their_readers() {
     let reads = (0..4 * REQUESTS).map(|_| ten(&store));
     let reads = futures::future::join_all(reads).await;
     assert!(reads.iter().all(Result::is_ok));
-    let busiest = server.busiest.load(std::sync::atomic::Ordering::SeqCst);
+    let busiest = server.busiest.load(Ordering::SeqCst);
     assert!((2..=REQUESTS).contains(&busiest), "{busiest} at once");
 
     *server.latency.lock().unwrap() = Duration::ZERO;
@@ -161,7 +189,7 @@ async fn requests_are_limited_and_end_with_their_readers() {
     let given_up = tokio::time::timeout(Duration::from_millis(100), ten(&store)).await;
     assert!(given_up.is_err(), "it stalls");
     for _ in 0..200 {
-        if server.gone.load(std::sync::atomic::Ordering::SeqCst) == 1 {
+        if server.gone.load(Ordering::SeqCst) == 1 {
             return;
         }
         tokio::time::sleep(Duration::from_millis(10)).await;
