@@ -88,6 +88,28 @@ pub enum CatalogError {
         /// Where it is.
         location: CatalogLocation,
     },
+    /// The server has no such database.
+    #[error(
+        "the catalog's server has no database of that name; make it, as with `createdb --owner USER \
+         DATABASE` on the server, or mend the address: {location}"
+    )]
+    NoDatabase {
+        /// What the server says.
+        source: sqlx::Error,
+        /// Where it was looked for.
+        location: CatalogLocation,
+    },
+    /// The server does not let this user in.
+    #[error(
+        "the catalog's server refuses the login; mend user and password in the address, or allow them in \
+         the server's pg_hba.conf: {location}"
+    )]
+    Login {
+        /// What the server says.
+        source: sqlx::Error,
+        /// Where it is.
+        location: CatalogLocation,
+    },
     /// The server may lose what it has acknowledged.
     #[error(
         "the catalog's server runs with {setting}=off and may lose acknowledged tiles at a power cut; \
@@ -186,6 +208,8 @@ impl CatalogError {
             Case::Foreign => Self::NotACatalog { location },
             Case::ReadOnly => Self::ReadOnly { location },
             Case::Unreachable => Self::Unreachable { source, location },
+            Case::NoDatabase => Self::NoDatabase { source, location },
+            Case::Login => Self::Login { source, location },
             Case::Other => Self::Database { source, location },
         }
     }
@@ -216,6 +240,39 @@ impl CatalogError {
         matches!(self, Self::Full { .. } | Self::Unreachable { .. })
     }
 
+    /// Where the catalog is, if that is told.
+    fn location(&self) -> Option<&CatalogLocation> {
+        match self {
+            Self::NotFound { location }
+            | Self::NotACatalog { location }
+            | Self::NewerSchema { location, .. }
+            | Self::OlderSchema { location, .. }
+            | Self::ReadOnly { location }
+            | Self::NetworkFilesystem { location, .. }
+            | Self::Address { location, .. }
+            | Self::Unreachable { location, .. }
+            | Self::NoDatabase { location, .. }
+            | Self::Login { location, .. }
+            | Self::NotDurable { location, .. }
+            | Self::Full { location, .. }
+            | Self::Database { location, .. } => Some(location),
+            Self::Missed { .. }
+            | Self::UnknownVolume { .. }
+            | Self::VolumeName(_)
+            | Self::WrongVolume { .. }
+            | Self::OutsideVolume { .. } => None,
+        }
+    }
+
+    /// What is wrong and how to mend it, without saying where the catalog is: for those who only look.
+    pub fn without_place(&self) -> String {
+        let text = self.to_string();
+        match self.location() {
+            Some(location) => text.replace(&format!(": {location}"), ""),
+            None => text,
+        }
+    }
+
     /// Whether another connection was in the way.
     pub(super) fn is_busy(&self) -> bool {
         // SQLITE_BUSY, SQLITE_LOCKED.
@@ -229,6 +286,8 @@ enum Case {
     Foreign,
     ReadOnly,
     Unreachable,
+    NoDatabase,
+    Login,
     Other,
 }
 
@@ -256,6 +315,8 @@ fn postgres_case(error: &sqlx::Error) -> Case {
                 Case::Unreachable
             }
             Some("53300") => Case::Unreachable,
+            Some("3D000") => Case::NoDatabase,
+            Some("28000" | "28P01") => Case::Login,
             _ => Case::Other,
         },
     }
@@ -277,5 +338,31 @@ fn list(names: &[String]) -> String {
         "none yet".to_owned()
     } else {
         names.join(", ")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_only_looks_is_not_told_where_the_catalog_is() {
+        let file = CatalogLocation::File("/srv/secret/catalog.sqlite".into());
+        let full = CatalogError::Full {
+            source: sqlx::Error::RowNotFound,
+            location: file,
+        };
+        assert!(full.to_string().contains("secret"));
+        assert_eq!(
+            full.without_place(),
+            "no space is left for the catalog; free some, then try again"
+        );
+        let server = CatalogLocation::parse("postgres://me:pw@host/secret");
+        let away = CatalogError::sort(sqlx::Error::PoolTimedOut, &server);
+        let told = away.without_place();
+        assert!(
+            told.contains("server does not answer") && !told.contains("secret"),
+            "{told}"
+        );
     }
 }

@@ -95,6 +95,20 @@ impl StorageError {
         }
     }
 
+    /// What is wrong and how to mend it, without saying where the storage is: for those who only look.
+    pub fn without_place(&self) -> String {
+        let text = self.to_string();
+        match self {
+            Self::Full { path, .. }
+            | Self::Denied { path, .. }
+            | Self::NotKept { path, .. }
+            | Self::Refused { path, .. }
+            | Self::Unavailable { path, .. }
+            | Self::Io { path, .. } => text.replace(&format!(": {path}"), ""),
+            Self::NotFound { .. } | Self::Name { .. } => text,
+        }
+    }
+
     /// Whether the same request may succeed later without anyone changing the request.
     pub fn is_transient(&self) -> bool {
         self.is_outage() || matches!(self, Self::Io { .. })

@@ -51,6 +51,23 @@ async fn what_is_no_catalog_is_left_alone() {
         "{refused:?}"
     );
 
+    let nowhere = CatalogLocation::parse(&url.replace("/db", "/nodb"));
+    for refused in [
+        Catalog::open(&nowhere).await,
+        Catalog::create(&nowhere).await,
+    ] {
+        assert!(
+            matches!(refused, Err(CatalogError::NoDatabase { .. })),
+            "{refused:?}"
+        );
+    }
+    let stranger = CatalogLocation::parse(&url.replace("saccade@", "nobody-here@"));
+    let refused = Catalog::open(&stranger).await;
+    assert!(
+        matches!(refused, Err(CatalogError::Login { .. })),
+        "{refused:?}"
+    );
+
     let nonsense = CatalogLocation::parse("postgres://host:port/db");
     let refused = Catalog::open(&nonsense).await;
     assert!(
