@@ -30,6 +30,7 @@ mod clock;
 mod commit;
 mod database;
 mod error;
+mod identity;
 mod location;
 mod postgres;
 mod rows;

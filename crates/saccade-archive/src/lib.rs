@@ -42,5 +42,5 @@ mod visualization;
 
 pub use catalog::CatalogLocation;
 pub use visualization::{
-    ArchiveError, ArchiveLocation, LocationError, StorageLocation, VisualizationArchive,
+    ArchiveError, ArchiveLocation, IDENTITY, LocationError, StorageLocation, VisualizationArchive,
 };

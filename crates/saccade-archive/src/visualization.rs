@@ -1,5 +1,6 @@
 //! The visualization archive: pyramids, below `tiles/` of a storage, and the catalog that names them.
 
+mod identity;
 mod location;
 
 use std::io;
@@ -9,6 +10,7 @@ use std::sync::Arc;
 use crate::catalog::{Catalog, CatalogError, CatalogLocation};
 use crate::storage::{Storage, StorageError};
 
+pub use identity::IDENTITY;
 pub use location::{ArchiveLocation, LocationError, StorageLocation};
 
 /// An open archive. Clones share it.
@@ -39,6 +41,18 @@ pub enum ArchiveError {
         /// The folder.
         path: PathBuf,
     },
+    /// The catalog names pyramids of another archive.
+    #[error(
+        "the catalog {catalog} and the pyramids in {storage} are not of one archive; name the folder that \
+         the catalog was made with, or the catalog that was made with the folder. If all pyramids of the \
+         catalog were lost, ingest the acquisition again into a new archive"
+    )]
+    Strangers {
+        /// Where the pyramids lie.
+        storage: StorageLocation,
+        /// Where the catalog is.
+        catalog: CatalogLocation,
+    },
     /// The catalog could not be opened.
     #[error(transparent)]
     Catalog(#[from] CatalogError),
@@ -66,7 +80,8 @@ impl VisualizationArchive {
         }
     }
 
-    /// Opens an archive, and makes it first if there is none.
+    /// Opens an archive, and makes it first if there is none. Its parts get an [`IDENTITY`] by which they are
+    /// known to belong together, if they have none.
     ///
     /// # Errors
     ///
@@ -92,20 +107,26 @@ impl VisualizationArchive {
                 Catalog::open(location.catalog()).await
             }
         };
-        match location.storage() {
+        let (catalog, storage) = match location.storage() {
             // After the catalog: where there is none, no folder is made.
             StorageLocation::Folder(_) => {
                 let catalog = catalog().await?;
                 let storage = location.storage().open().await?;
-                Ok(Self { catalog, storage })
+                (catalog, storage)
             }
             StorageLocation::Bucket(_) => {
                 // Before a catalog is made: a wrong address should not leave one behind.
                 let storage = location.storage().open().await?;
                 let catalog = catalog().await?;
-                Ok(Self { catalog, storage })
+                (catalog, storage)
             }
+        };
+        if create {
+            identity::make(&catalog, &*storage, location).await?;
+        } else {
+            identity::check(&catalog, &*storage, location).await?;
         }
+        Ok(Self { catalog, storage })
     }
 
     /// An archive of these parts.
