@@ -19,7 +19,8 @@ pub struct IngestOptions {
     pub patience: u32,
     /// Records taken up per look.
     pub batch: usize,
-    /// First pause after a failed write; pauses double up to sixteen of it.
+    /// First pause after a failed write; pauses double up to sixteen of it, and to two of it while the disk is
+    /// full or the catalog's server away.
     pub retry: Duration,
     /// How long what a worker has claimed stays its own after its last sign of life. Such a sign is
     /// given four times as often.

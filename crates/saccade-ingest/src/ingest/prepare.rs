@@ -342,10 +342,12 @@ pub(super) fn pyramid_name(volume: &str, record: &TileRecord, position: u64) -> 
     )
 }
 
-/// Pauses between attempts: doubling, up to sixteen times the first.
+/// Pauses between attempts: doubling, up to sixteen times the first. What is waited out, however long, is looked
+/// for more often: when it is there again, work goes on soon.
 pub(super) struct Backoff {
+    first: Duration,
     pause: Duration,
-    longest: Duration,
+    outage: bool,
     pub(super) failures: u32,
 }
 
@@ -355,8 +357,9 @@ impl Backoff {
 
     pub(super) fn new(first: Duration) -> Self {
         Self {
+            first,
             pause: first,
-            longest: first * 16,
+            outage: false,
             failures: 0,
         }
     }
@@ -364,6 +367,7 @@ impl Backoff {
     /// Counts a failure. An outage is waited out; what may pass is tried some times.
     pub(super) fn may_go_on(&mut self, outage: bool, transient: bool) -> bool {
         self.failures += 1;
+        self.outage = outage;
         outage || (transient && self.failures < Self::ATTEMPTS)
     }
 
@@ -375,8 +379,14 @@ impl Backoff {
         if self.failures == 1 {
             progress.notice(&format!("{}; trying again", with_sources(error)));
         }
-        tokio::time::sleep(self.pause).await;
-        self.pause = (self.pause * 2).min(self.longest);
+        tokio::time::sleep(self.next_pause()).await;
+    }
+
+    fn next_pause(&mut self) -> Duration {
+        let longest = self.first * if self.outage { 2 } else { 16 };
+        let pause = self.pause.min(longest);
+        self.pause = (self.pause * 2).min(longest);
+        pause
     }
 }
 
@@ -392,6 +402,21 @@ fn with_sources(error: &(dyn std::error::Error + 'static)) -> String {
 mod tests {
     use super::*;
     use saccade_archive::storage::check_name;
+
+    #[test]
+    fn outages_are_looked_after_often_and_other_failures_ever_less() {
+        let first = Duration::from_secs(1);
+        let pauses = |outage| {
+            let mut backoff = Backoff::new(first);
+            let pause = |_| {
+                assert!(backoff.may_go_on(outage, true));
+                backoff.next_pause().as_secs()
+            };
+            (0..7).map(pause).collect::<Vec<_>>()
+        };
+        assert_eq!(pauses(true), [1, 2, 2, 2, 2, 2, 2]);
+        assert_eq!(pauses(false), [1, 2, 4, 8, 16, 16, 16]);
+    }
 
     #[test]
     fn every_record_has_its_own_pyramid_name() {

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::path::Path;
 use std::pin::pin;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use futures::TryStreamExt;
 use futures::future::{Either, select};
@@ -13,9 +13,10 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{
     AcquisitionError, AcquisitionInfo, Record, RecordLine, RecordReader, TileRecord,
 };
-use saccade_archive::catalog::{Claim, Quarantined, Waiting, Worker};
+use saccade_archive::catalog::{CatalogError, Claim, Quarantined, Waiting, Worker};
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
+use tokio::time::Instant;
 
 use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, retry};
 use super::prepare::{Backoff, Context, Outcome, Stored, quarantine};
@@ -23,6 +24,9 @@ use super::waiting::{Due, WaitingRoom};
 use super::{IngestError, IngestOptions, process};
 use crate::cancel::Cancel;
 use crate::progress::{Meter, Progress, State};
+
+/// Longest pause between looks for workers of this machine that were killed.
+const LOOK_FOR_THE_DEAD: Duration = Duration::from_secs(1);
 
 /// Retired pyramids deleted per look.
 const DELETE_AT_ONCE: u32 = 64;
@@ -138,14 +142,38 @@ fn worker_name() -> String {
     format!("{}:{}", host.trim(), std::process::id())
 }
 
-/// Gives signs of life, until dropped. Without them, others take over: that is what they are for.
+/// Gives signs of life, until dropped. Without them, others take over: that is what they are for. Those of this
+/// machine that can give none are looked for, however much there is to do.
 async fn keep_alive(archive: &VisualizationArchive, worker: &Worker) {
+    let pause = (worker.lease() / 4).min(LOOK_FOR_THE_DEAD);
+    let (mut sign, mut look) = (Instant::now(), Instant::now());
     loop {
-        tokio::time::sleep(worker.lease() / 4).await;
-        if let Err(e) = archive.catalog().keep_alive(worker).await {
-            log::warn!("no sign of life could be given: {e}");
+        tokio::time::sleep(pause).await;
+        if sign.elapsed() + pause > worker.lease() / 4 {
+            sign = Instant::now();
+            if let Err(e) = archive.catalog().keep_alive(worker).await {
+                log::warn!("no sign of life could be given: {e}");
+            }
+        }
+        if look.elapsed() + pause > LOOK_FOR_THE_DEAD {
+            look = Instant::now();
+            if let Err(e) = bury_the_dead(archive).await {
+                log::debug!("workers that have ended could not be looked for: {e}");
+            }
         }
     }
+}
+
+/// Frees what workers have claimed that were killed on this machine. The leases of others are waited for.
+async fn bury_the_dead(archive: &VisualizationArchive) -> Result<(), CatalogError> {
+    let catalog = archive.catalog();
+    for process in catalog.processes().await? {
+        if process::is_gone(&process) {
+            catalog.bury(&process).await?;
+            log::info!("a worker has ended without leave, its records are free: {process}");
+        }
+    }
+    Ok(())
 }
 
 struct Ingest<'a> {
@@ -189,7 +217,8 @@ impl Ingest<'_> {
                 &self.left,
             ));
             if worked == 0 && queued + waiting > 0 {
-                self.bury_the_dead().await?;
+                let bury = || bury_the_dead(self.archive);
+                retry(self.options, self.context.progress, bury).await?;
             }
             // Others may still be at work; should they die, it is this one's turn.
             if worked == 0 && self.options.once && queued + waiting == 0 {
@@ -243,18 +272,6 @@ impl Ingest<'_> {
         self.summary.deleted += read.deleted;
         self.summary.quarantined += read.quarantined;
         Ok(worked)
-    }
-
-    /// Frees what workers have claimed that were killed on this machine. The leases of others are waited for.
-    async fn bury_the_dead(&self) -> Result<(), IngestError> {
-        let catalog = self.archive.catalog();
-        let (options, progress) = (self.options, self.context.progress);
-        let processes = retry(options, progress, || catalog.processes()).await?;
-        for process in processes.iter().filter(|process| process::is_gone(process)) {
-            retry(options, progress, || catalog.bury(process)).await?;
-            log::info!("a worker has ended without leave, its records are free: {process}");
-        }
-        Ok(())
     }
 
     async fn count(&self) -> Result<(u64, u64), IngestError> {

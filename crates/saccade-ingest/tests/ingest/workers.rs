@@ -1,6 +1,7 @@
 //! Several workers on one volume, in this process.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
 use glam::UVec2;
@@ -8,8 +9,8 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{Cursor, Record, RecordReader};
 use saccade_archive::catalog::{Catalog, CatalogLocation, ChangeReason, Waiting};
 use saccade_archive::storage::LocalStorage;
-use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
+use saccade_ingest::{Cancel, Progress, State};
 
 use crate::postgres::Server;
 use crate::scope::{
@@ -140,6 +141,93 @@ async fn a_server_that_is_away_is_waited_for() {
     let alone = crate::scope::archive(alone_folder.path()).await;
     scope.ingest(&alone).await;
     assert!(seen(&archive).await == seen(&alone).await);
+}
+
+/// Says another tile whenever one was entered: there is always more to do.
+struct Busy<'a> {
+    scope: &'a Scope,
+    said: AtomicU32,
+    catalog_has: AtomicBool,
+}
+
+impl Progress for Busy<'_> {
+    fn update(&self, _: &State) {
+        if self.catalog_has.load(Ordering::Relaxed) {
+            return;
+        }
+        for _ in 0..4 {
+            let n = self.said.fetch_add(1, Ordering::Relaxed);
+            let Record::Tile(mut record) = tile_record(&format!("more{n}"), n % 4, SIZE) else {
+                panic!("a tile")
+            };
+            record.file = "tiles/first.tif".to_owned();
+            self.scope.say(&Record::Tile(record));
+        }
+    }
+
+    fn notice(&self, _: &str) {}
+}
+
+/// What a killed worker of this machine had is taken up by one that has enough to do, long before the lease ends.
+#[cfg(target_os = "linux")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_busy_worker_takes_up_what_a_killed_one_had() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    scope.tile("first", 0, SIZE, 1);
+    let archive = archive(folder.path()).await;
+    scope.ingest(&archive).await;
+    let catalog = archive.catalog();
+    let mut reader = RecordReader::new(scope.path(), catalog.cursor(VOLUME).await.unwrap());
+    scope.tile("claimed", 0, SIZE, 2);
+    let from = reader.cursor();
+    let line = reader.read(1).unwrap().remove(0);
+    let Ok(Record::Tile(record)) = line.record else {
+        panic!("a tile")
+    };
+    let waiting = Waiting {
+        position: line.offset,
+        record,
+        reason: "its turn has not come".to_owned(),
+    };
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit.advance(from, line.next).await.unwrap();
+    commit.enqueue(&waiting).await.unwrap();
+    commit.finish().await.unwrap();
+    // One that had this process's number when the machine was started.
+    let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap();
+    let space = std::fs::read_link("/proc/self/ns/pid").unwrap();
+    let (boot, space, number) = (boot.trim(), space.display(), std::process::id());
+    let process = format!("{boot} {space}/{number}/1");
+    let lease = Duration::from_secs(3600);
+    let killed = catalog.register_process("killed", &process, lease);
+    let killed = killed.await.unwrap();
+    assert_eq!(catalog.claim(VOLUME, &killed, 9).await.unwrap().len(), 1);
+
+    let busy = Busy {
+        scope: &scope,
+        said: AtomicU32::new(0),
+        catalog_has: AtomicBool::new(false),
+    };
+    let options = IngestOptions {
+        once: false,
+        lease,
+        batch: 1 << 20,
+        ..quick()
+    };
+    let cancel = Cancel::new();
+    let work = run(scope.path(), &archive, &options, &busy, &cancel);
+    let watch = async {
+        while catalog.tile(VOLUME, "claimed").await.unwrap().is_none() {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        busy.catalog_has.store(true, Ordering::Relaxed);
+        cancel.cancel();
+    };
+    let both = async { tokio::join!(work, watch) };
+    let (done, ()) = tokio::time::timeout(Duration::from_secs(40), both)
+        .await
+        .expect("it is left to the killed worker");
+    assert!(done.unwrap().tiles > 1);
 }
 
 /// A record that ended worker after worker is set aside, and the others are done.
