@@ -37,8 +37,8 @@ use crate::{ChunkError, VolumeSource};
 use plan::{Plan, ShardId};
 use shard::ShardEncoder;
 
-/// Where an export says what it is, as long as it is not whole.
-const STATE: &str = "export.json";
+/// Object in which an export says what it is, as long as it is not whole.
+pub const UNFINISHED: &str = "export.json";
 /// What makes a folder an image.
 const GROUP: &str = "zarr.json";
 /// Shards at a time: one is read while the other is compressed and written.
@@ -93,7 +93,10 @@ pub struct ExportProgress {
 #[non_exhaustive]
 pub enum ExportError {
     /// No voxel of the volume is in the part.
-    #[error("nothing of the volume, {extent} voxels, lies in {region:?}; give a part of it")]
+    #[error(
+        "nothing of the volume lies in the region {}: the volume is {}; give a part of it",
+        ranges(*region), ranges(VoxelBox::of_size(*extent))
+    )]
     Region {
         /// As asked for.
         region: VoxelBox,
@@ -121,12 +124,12 @@ pub enum ExportError {
     Exists,
     /// Something else was begun there.
     #[error(
-        "another export was begun there ({begun}), and this one differs; repeat that one to go on with it, or \
-         export to another place"
+        "another export was begun there: {differences}; repeat that one to go on with it, or export to another \
+         place"
     )]
     Other {
-        /// What that one is.
-        begun: String,
+        /// What differs between that one and this.
+        differences: String,
     },
     /// Voxels could not be had.
     #[error("cannot read what is to be exported")]
@@ -222,7 +225,7 @@ pub async fn export(
             .await?;
     }
     storage.write_durable(GROUP, pretty(&plan.group())).await?;
-    storage.delete(STATE).await?;
+    storage.delete(UNFINISHED).await?;
     Ok(state)
 }
 
@@ -230,7 +233,7 @@ pub async fn export(
 async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<bool, ExportError> {
     let ours = plan.description();
     let with_revision = serde_json::json!({ "export": ours, "revision": revision });
-    let state = match storage.read(STATE, None).await {
+    let state = match storage.read(UNFINISHED, None).await {
         Ok(state) => Some(state),
         Err(StorageError::NotFound { .. }) => None,
         Err(error) => return Err(error.into()),
@@ -238,8 +241,8 @@ async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<bool
     if let Some(state) = state {
         let begun: serde_json::Value = serde_json::from_slice(&state).unwrap_or_default();
         if begun["export"] != ours {
-            let begun = begun["export"].to_string();
-            return Err(ExportError::Other { begun });
+            let differences = plan::differences(&begun["export"], &ours);
+            return Err(ExportError::Other { differences });
         }
         if begun == with_revision {
             return Ok(true);
@@ -247,7 +250,9 @@ async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<bool
     } else if !storage.list("").await?.is_empty() {
         return Err(ExportError::Exists);
     }
-    storage.write_durable(STATE, pretty(&with_revision)).await?;
+    storage
+        .write_durable(UNFINISHED, pretty(&with_revision))
+        .await?;
     Ok(false)
 }
 
@@ -260,6 +265,12 @@ async fn write(storage: &dyn Storage, key: &str, bytes: Option<Bytes>) -> Result
     let len = bytes.len() as u64;
     storage.write_durable(key, bytes).await?;
     Ok(len)
+}
+
+/// A box, for people.
+fn ranges(voxels: VoxelBox) -> String {
+    let axis = |name: &str, n: usize| format!("{name} {} to {}", voxels.min[n], voxels.max[n]);
+    [axis("x", 0), axis("y", 1), axis("z", 2)].join(", ")
 }
 
 fn pretty(value: &serde_json::Value) -> Bytes {

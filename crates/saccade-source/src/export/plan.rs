@@ -229,6 +229,45 @@ impl Plan {
     }
 }
 
+/// What is told of an export.
+type Fact<'a> = dyn Fn(&Value) -> String + 'a;
+
+/// What differs between two exports, as [`Plan::description`] has them, in a line.
+pub(super) fn differences(there: &Value, now: &Value) -> String {
+    let list = |value: &Value| match value {
+        Value::Array(items) => {
+            let items: Vec<_> = items.iter().map(ToString::to_string).collect();
+            items.join(",")
+        }
+        Value::Null => "unknown".to_owned(),
+        value => value.to_string(),
+    };
+    let region = |of: &Value| format!("{},{}", list(&of["min"]), list(&of["max"]));
+    let level = |of: &Value| of["extents"][0].clone();
+    let stored = |of: &Value| of["arrays"][0]["codecs"][0]["configuration"]["codecs"].clone();
+    let compression = |of: &Value| match &stored(of)[1]["configuration"]["level"] {
+        Value::Null => "none".to_owned(),
+        level => level.to_string(),
+    };
+    let facts: [(&str, &Fact<'_>); 6] = [
+        ("volume", &|of| list(&of["volume"])),
+        ("the volume's extent", &|of| list(&level(of))),
+        ("finest level", &|of| list(&of["finest"])),
+        ("region in voxels of that level", &region),
+        ("channels", &|of| list(&of["channels"])),
+        ("compression", &compression),
+    ];
+    let differing = facts.iter().filter_map(|(name, fact)| {
+        let (there, now) = (fact(there), fact(now));
+        (there != now).then(|| format!("{name} {there} there, {now} now"))
+    });
+    let differing: Vec<_> = differing.collect();
+    match differing.is_empty() {
+        true => "its levels or chunks are others".to_owned(),
+        false => differing.join("; "),
+    }
+}
+
 /// As many chunks as fit into the limits, and no more than there are.
 fn shard_size(size: UVec3, chunk: UVec3, dtype: Dtype) -> UVec3 {
     let chunks: [u32; 3] = std::array::from_fn(|axis| size[axis].div_ceil(chunk[axis]));

@@ -175,7 +175,7 @@ fn every_voxel_of_every_level_is_where_it_was() {
                 );
             }
         }
-        assert!(!folder.path().join(STATE).exists());
+        assert!(!folder.path().join(UNFINISHED).exists());
     }
 }
 
@@ -263,9 +263,19 @@ fn what_is_there_is_not_mixed_with_something_else() {
     };
     let refused = run(export(&source, &storage, &other, &|_| {}));
     assert!(
-        matches!(refused, Err(ExportError::Other { .. })),
+        matches!(&refused, Err(ExportError::Other { differences }) if differences == "compression 3 there, none now"),
         "{refused:?}"
     );
+    let other = ExportOptions {
+        region: Some(VoxelBox::new(UVec3::new(1, 2, 3), UVec3::splat(20))),
+        channels: Some(vec![1]),
+        ..options.clone()
+    };
+    let refused = run(export(&source, &storage, &other, &|_| {})).unwrap_err();
+    let text = refused.to_string();
+    assert!(text.contains("channels 0,1,2 there, 1 now"), "{text}");
+    assert!(text.contains("1,2,3,20,20,13 now"), "{text}");
+    assert!(text.len() < 400, "{text}");
     run(export(&source, &storage, &options, &|_| {})).unwrap();
     let refused = run(export(&source, &storage, &options, &|_| {}));
     assert!(matches!(refused, Err(ExportError::Exists)), "{refused:?}");
@@ -304,7 +314,11 @@ fn what_cannot_be_is_refused_in_words() {
         region: Some(outside),
         ..default()
     };
-    assert!(refused(options).contains("75"));
+    let told = refused(options);
+    assert!(
+        told.contains("x 75 to 80, y 0 to 5, z 0 to 5: the volume is x 0 to 75"),
+        "{told}"
+    );
     for channels in [vec![3], vec![1, 1]] {
         let options = ExportOptions {
             channels: Some(channels),

@@ -1,12 +1,12 @@
 //! `saccade export`: a volume, or a part of one, as files that need no Saccade.
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use glam::UVec3;
 use indicatif::{ProgressBar, ProgressStyle};
 use saccade_archive::StorageLocation;
 use saccade_core::voxel_box::VoxelBox;
-use saccade_source::export::{ExportOptions, ExportProgress, export};
+use saccade_source::export::{ExportError, ExportOptions, ExportProgress, export};
 
 use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
@@ -112,7 +112,12 @@ impl Export {
             }
         };
         bar.finish_and_clear();
-        let done = done?;
+        let done = match done {
+            Err(error @ (ExportError::Exists | ExportError::Other { .. })) => {
+                bail!("{error}: {}", self.out)
+            }
+            done => done?,
+        };
         if let StorageLocation::Folder(folder) = &self.out {
             // Empty now, and no part of the image.
             drop(std::fs::remove_dir(folder.join(".incoming")));
