@@ -50,7 +50,8 @@ pub use acquisition::AcquisitionReader;
 pub use options::{BackgroundError, ViewOptions, background_from_text, show_channels};
 pub use page::{PageError, PageOptions};
 pub use shown::{
-    Shown, ShownError, Slice, box_from_text, channels_from_text, mode_from_text, slice_from_text,
+    OutsideError, Shown, ShownError, Slice, box_from_text, channels_from_text, mode_from_text,
+    slice_from_text,
 };
 
 #[cfg(not(target_family = "wasm"))]

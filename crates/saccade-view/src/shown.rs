@@ -129,7 +129,81 @@ fn numbers(text: &str) -> Option<Vec<f64>> {
     finite.collect()
 }
 
+/// Nothing of the volume would be seen.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum OutsideError {
+    /// The plane does not meet the volume.
+    #[error("the slice {axis}={at} is outside the volume, in which {axis} goes from 0 to {last}")]
+    Slice {
+        /// x, y or z.
+        axis: &'static str,
+        /// As given \[level-0 voxels\].
+        at: f64,
+        /// The last voxel there is.
+        last: u32,
+    },
+    /// The box does not meet the volume, or the plane does not meet the box.
+    #[error(
+        "nothing of the volume is in the clip box: along {axis} it goes from {from} to {to}, and what can be \
+         seen from {low} to {high}"
+    )]
+    Clip {
+        /// x, y or z.
+        axis: &'static str,
+        /// Where the box begins \[level-0 voxels\].
+        from: f64,
+        /// Where it ends.
+        to: f64,
+        /// Where what can be seen begins.
+        low: f64,
+        /// Where it ends.
+        high: f64,
+    },
+}
+
 impl Shown {
+    /// Refuses what shows nothing of a volume.
+    ///
+    /// # Errors
+    ///
+    /// [`OutsideError`].
+    pub fn check(&self, volume: &Volume) -> Result<(), OutsideError> {
+        let extent = volume.extent();
+        let mut low = DVec3::ZERO;
+        let mut high = extent.as_dvec3();
+        if let Some(Slice { axis, at }) = self.slice {
+            let axis = axis % 3;
+            if !(0.0..f64::from(extent[axis])).contains(&at) {
+                let last = extent[axis].saturating_sub(1);
+                let axis = AXES[axis];
+                return Err(OutsideError::Slice { axis, at, last });
+            }
+            (low[axis], high[axis]) = (at, at);
+        }
+        let Some([one, other]) = self.within else {
+            return Ok(());
+        };
+        let (min, max) = (one.min(other), one.max(other));
+        for axis in 0..3 {
+            let thin = low[axis] == high[axis];
+            let meets = match thin {
+                true => min[axis] <= low[axis] && low[axis] <= max[axis],
+                false => min[axis] < high[axis] && low[axis] < max[axis],
+            };
+            if !meets {
+                return Err(OutsideError::Clip {
+                    axis: AXES[axis],
+                    from: min[axis],
+                    to: max[axis],
+                    low: low[axis],
+                    high: high[axis],
+                });
+            }
+        }
+        Ok(())
+    }
+
     /// How samples become colours.
     pub fn drawn_mode(&self) -> Mode {
         match self.slice {
@@ -186,6 +260,38 @@ mod tests {
         for bad in ["", "-1", "a", "1,,2", "1.5"] {
             assert!(channels_from_text(bad).is_err(), "{bad:?}");
         }
+    }
+
+    #[test]
+    fn what_shows_nothing_is_refused_with_what_would_do() {
+        let volume = Volume::new("v", UVec3::new(90, 80, 70), DVec3::ONE).unwrap();
+        let check = |slice: Option<&str>, within: Option<&str>| {
+            let shown = Shown {
+                slice: slice.map(|text| slice_from_text(text).unwrap()),
+                within: within.map(|text| box_from_text(text).unwrap()),
+                ..Shown::default()
+            };
+            shown.check(&volume).map_err(|error| error.to_string())
+        };
+        for good in ["z=0", "z=69", "z=69.9", "x=89", "y=3.5"] {
+            assert_eq!(check(Some(good), None), Ok(()), "{good}");
+        }
+        for bad in ["z=70", "z=-0.1", "x=9999", "y=80"] {
+            assert!(check(Some(bad), None).is_err(), "{bad}");
+        }
+        let told = check(Some("z=9999"), None).unwrap_err();
+        assert!(
+            told.contains("z=9999") && told.contains("from 0 to 69"),
+            "{told}"
+        );
+        for good in ["-5,-5,-5,1,1,1", "89,79,69,500,500,500", "40,10,3,0,5,60"] {
+            assert_eq!(check(None, Some(good)), Ok(()), "{good}");
+        }
+        for bad in ["90,0,0,99,80,70", "-9,0,0,0,80,70", "0,0,200,9,9,300"] {
+            assert!(check(None, Some(bad)).is_err(), "{bad}");
+        }
+        assert_eq!(check(Some("z=5"), Some("0,0,5,9,9,9")), Ok(()));
+        assert!(check(Some("z=4"), Some("0,0,5,9,9,9")).is_err());
     }
 
     #[test]

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
-use saccade_core::transfer::TransferFunction;
+use saccade_core::transfer::{OpacityPoint, TransferFunction};
 use saccade_render::{Gpu, Mode, View};
 use saccade_stream::{Session, SessionOptions, SettleError, Status};
 use saccade_view::{
@@ -26,6 +26,13 @@ struct Channels(Vec<u32>);
 
 fn channels(text: &str) -> Result<Channels, ShownError> {
     channels_from_text(text).map(Channels)
+}
+
+/// A value of the value type's range.
+fn iso(text: &str) -> Result<f32, String> {
+    let value: Option<f32> = text.parse().ok();
+    let value = value.filter(|value| (0.0..=1.0).contains(value));
+    value.ok_or_else(|| "give a number from 0 to 1".to_owned())
 }
 
 /// Draw a volume into a PNG file. Waits until the picture is complete.
@@ -67,7 +74,7 @@ pub(crate) struct Render {
 
     /// With --mode surface, the value of the surface, 0 to 1 of the value type's range [default: between the
     /// opacities' ends]
-    #[arg(long, value_name = "VALUE")]
+    #[arg(long, value_name = "VALUE", value_parser = iso)]
     iso: Option<f32>,
 
     /// Show a part only: two opposite corners [voxels of the finest level]
@@ -123,6 +130,12 @@ impl Render {
             .await?;
         opened.tell_of_labels();
         let source = opened.source;
+        let shown = Shown {
+            mode: self.mode,
+            within: self.clip,
+            slice: self.slice,
+        };
+        shown.check(source.volume())?;
         let gpu = Gpu::headless().await?;
         let gpu_bytes = u64::from(self.gpu_memory) << 20;
         let options = SessionOptions {
@@ -140,11 +153,6 @@ impl Render {
                 session.set_iso(channel, Some(iso))?;
             }
         }
-        let shown = Shown {
-            mode: self.mode,
-            within: self.clip,
-            slice: self.slice,
-        };
         let view = View {
             background: self.background,
             mode: shown.drawn_mode(),
@@ -204,8 +212,34 @@ impl Render {
         };
         let transfer = serde_json::from_str(&json)
             .with_context(|| format!("this is no transfer function as JSON: {place}"))?;
+        refuse_nonsense(&transfer).with_context(|| format!("this shows nothing: {place}"))?;
         Ok(Some(transfer))
     }
+}
+
+/// A transfer function with which no picture can be drawn.
+fn refuse_nonsense(transfer: &TransferFunction) -> Result<()> {
+    let [low, high] = transfer.window;
+    ensure!(
+        low.is_finite() && high.is_finite() && low != high,
+        "the two ends of the window have to differ, not {low} and {high}"
+    );
+    let length = transfer.opacity_length_nm;
+    ensure!(
+        length.is_finite() && length > 0.0,
+        "opacity_length_nm has to be above 0, not {length}"
+    );
+    let within = |value: f32| (0.0..=1.0).contains(&value);
+    let sensible = |point: &OpacityPoint| within(point.value) && within(point.opacity);
+    ensure!(
+        transfer.opacity.iter().all(sensible),
+        "values and opacities go from 0 to 1"
+    );
+    ensure!(
+        transfer.opacity.is_sorted_by(|a, b| a.value <= b.value),
+        "the points of the opacity have to be in the order of their values"
+    );
+    Ok(())
 }
 
 /// How true the picture is, on one line.
