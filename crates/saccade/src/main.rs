@@ -10,6 +10,7 @@
 
 mod arguments;
 mod commands;
+mod folders;
 mod interrupt;
 mod open;
 mod progress;

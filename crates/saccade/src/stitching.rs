@@ -2,9 +2,14 @@
 
 use std::path::PathBuf;
 
+use anyhow::{Result, ensure};
 use clap::{Args, ValueEnum};
-use saccade_source::stitched::{AlongZ, DiskCache, Gaps, Interpolation, Overlaps, StitchedOptions};
+use saccade_archive::ArchiveLocation;
+use saccade_source::stitched::{
+    AlongZ, DiskCache, DiskCacheError, Gaps, Interpolation, Overlaps, StitchedOptions,
+};
 
+use crate::folders::overlap;
 use crate::report::say;
 
 /// How volumes of an archive are stitched.
@@ -33,9 +38,40 @@ pub(crate) struct Stitching {
     #[arg(long, value_name = "FOLDER")]
     disk_cache: Option<PathBuf>,
 
-    /// What that folder may take [GB]
-    #[arg(long, value_name = "GB", default_value_t = 20, requires = "disk_cache")]
-    disk_cache_size: u64,
+    /// What that folder may take [GB], or with another unit, such as 500MB or 1.5TB
+    #[arg(long, value_name = "GB", default_value = "20", value_parser = cache_size, requires = "disk_cache")]
+    disk_cache_size: CacheSize,
+}
+
+/// Size of the cache on disk [bytes].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct CacheSize(u64);
+
+fn cache_size(text: &str) -> Result<CacheSize, String> {
+    let text = text.trim();
+    let end = text.find(|c: char| c.is_ascii_alphabetic());
+    let (number, unit) = text.split_at(end.unwrap_or(text.len()));
+    let unit = match unit.to_ascii_uppercase().as_str() {
+        "MB" => 1e6,
+        "" | "GB" => 1e9,
+        "TB" => 1e12,
+        "MIB" => f64::from(1 << 20),
+        "GIB" => f64::from(1 << 30),
+        _ => return Err("sizes are in GB, or end with MB, GB or TB".to_owned()),
+    };
+    let number: f64 = { number.trim().parse() }
+        .map_err(|_| "give a number of GB, such as 20 or 1.5, or with a unit, such as 500MB")?;
+    let bytes = number * unit;
+    let least = DiskCache::LEAST_BYTES;
+    if !(bytes >= least as f64 && bytes <= 1e18) {
+        let least = least.div_ceil(1_000_000);
+        return Err(format!(
+            "a cache on disk takes {least} MB at least; leave out --disk-cache for none"
+        ));
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "within bounds")]
+    let bytes = bytes as u64;
+    Ok(CacheSize(bytes))
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -65,20 +101,33 @@ enum Sections {
 }
 
 impl Stitching {
-    /// Opens the cache on disk as well; where that fails, says so and goes on without.
-    pub(crate) async fn options(&self) -> StitchedOptions {
+    /// How volumes of this archive are stitched. Opens the cache on disk as well; where that fails, says so and
+    /// goes on without.
+    ///
+    /// A folder that is something else is refused.
+    pub(crate) async fn options(&self, archive: &ArchiveLocation) -> Result<StitchedOptions> {
         let disk_cache = match &self.disk_cache {
             None => None,
             Some(folder) => {
-                let bytes = self.disk_cache_size.saturating_mul(1_000_000_000);
-                let opened = DiskCache::open(folder, bytes).await;
-                if let Err(error) = &opened {
-                    say(&format!("without a cache on disk: {error}"));
+                if let Some(archive) = archive.folder() {
+                    ensure!(
+                        !overlap(folder, archive)?,
+                        "the cache on disk can be neither in the archive's folder nor around it: name \
+                         another folder with --disk-cache than {}",
+                        folder.display()
+                    );
                 }
-                opened.ok()
+                match DiskCache::open(folder, self.disk_cache_size.0).await {
+                    Ok(cache) => Some(cache),
+                    Err(error @ DiskCacheError::Foreign { .. }) => return Err(error.into()),
+                    Err(error) => {
+                        say(&format!("without a cache on disk: {error}"));
+                        None
+                    }
+                }
             }
         };
-        StitchedOptions {
+        Ok(StitchedOptions {
             interpolation: self.interpolation.map(|between| match between {
                 Between::Nearest => Interpolation::Nearest,
                 Between::Linear => Interpolation::Linear,
@@ -99,6 +148,39 @@ impl Stitching {
             },
             disk_cache,
             ..StitchedOptions::default()
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_fractions_and_units() {
+        for (text, bytes) in [
+            ("20", 20_000_000_000),
+            ("1.5", 1_500_000_000),
+            ("1.5GB", 1_500_000_000),
+            ("500 MB", 500_000_000),
+            ("2tb", 2_000_000_000_000),
+            ("1GiB", 1 << 30),
+        ] {
+            assert_eq!(cache_size(text), Ok(CacheSize(bytes)), "{text}");
         }
+        for bad in [
+            "",
+            "GB",
+            "0",
+            "0.1",
+            "-3",
+            "nan",
+            "inf",
+            "1e30",
+            "3 potatoes",
+        ] {
+            assert!(cache_size(bad).is_err(), "{bad}");
+        }
+        assert!(cache_size("0").unwrap_err().contains("269 MB at least"));
     }
 }

@@ -25,6 +25,7 @@ use foyer::{
     BlockEngineConfig, DeviceBuilder, FsDeviceBuilder, HybridCache, HybridCacheBuilder, Load,
     PsyncIoEngineConfig, RecoverMode,
 };
+use saccade_archive::IDENTITY;
 use saccade_archive::storage::{Storage, StorageError};
 
 /// Unit in which the cache is written over \[bytes\]: several blocks of voxels.
@@ -33,6 +34,12 @@ const UNIT: u64 = 64 << 20;
 const LEAST: u64 = 4;
 /// How its files are named, as far as their number.
 const FILES: &str = "foyer-storage-direct-fs-";
+/// The file that one process has locked.
+const LOCK: &str = "lock";
+/// The file that says what the folder is.
+const MARKER: &str = "saccade-disk-cache";
+/// What else an empty folder may hold: the root of a file system has this.
+const LOST_AND_FOUND: &str = "lost+found";
 
 /// Why a folder cannot be used as a cache.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +48,16 @@ pub enum DiskCacheError {
     /// Another process has it.
     #[error("another process uses the cache folder; give each its own: {}", folder.display())]
     Taken {
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// It holds something else.
+    #[error(
+        "the folder holds other things than a cache and is left as it is; name an empty or new one for the \
+         cache on disk: {}",
+        folder.display()
+    )]
+    Foreign {
         /// The folder.
         folder: PathBuf,
     },
@@ -77,7 +94,11 @@ impl PartialEq for DiskCache {
 }
 
 impl DiskCache {
-    /// Opens a folder, made if it is not there, that takes at most `bytes` (and at least 256 MiB).
+    /// Least that a cache takes \[bytes\].
+    pub const LEAST_BYTES: u64 = LEAST * UNIT;
+
+    /// Opens a folder, made if it is not there, that takes at most `bytes` (and at least
+    /// [`Self::LEAST_BYTES`]).
     ///
     /// # Errors
     ///
@@ -94,9 +115,12 @@ impl DiskCache {
             let prepared = prepared.unwrap_or_else(|e| Err(io::Error::other(e)));
             prepared.map_err(|e| failed(e.into()))?
         };
-        let lock = lock.ok_or_else(|| DiskCacheError::Taken {
-            folder: folder.to_owned(),
-        })?;
+        let named = || folder.to_owned();
+        let lock = match lock {
+            Prepared::Ours(lock) => lock,
+            Prepared::Taken => return Err(DiskCacheError::Taken { folder: named() }),
+            Prepared::Foreign => return Err(DiskCacheError::Foreign { folder: named() }),
+        };
         let size = |bytes: u64| usize::try_from(bytes).unwrap_or(usize::MAX);
         let device = FsDeviceBuilder::new(folder).with_capacity(size(units * UNIT));
         let device = device.build().map_err(|e| failed(e.into()))?;
@@ -189,15 +213,47 @@ fn key(description: &[u8]) -> u64 {
         })
 }
 
+/// What a folder is.
+enum Prepared {
+    /// This process's.
+    Ours(File),
+    /// Another process's.
+    Taken,
+    /// No cache's.
+    Foreign,
+}
+
+/// Whether a folder may become a cache, or is one: also one of an earlier version, which had no marker.
+fn is_cache(folder: &Path) -> io::Result<bool> {
+    if folder.join(MARKER).is_file() {
+        return Ok(true);
+    }
+    for entry in std::fs::read_dir(folder)? {
+        let name = entry?.file_name();
+        let known = |name: &str| [LOCK, LOST_AND_FOUND].contains(&name) || name.starts_with(FILES);
+        if !name.to_str().is_some_and(known) {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
 /// Makes the folder, takes it if nobody has it, and removes files of a larger cache.
-fn prepare(folder: &Path, units: u64) -> io::Result<Option<File>> {
+fn prepare(folder: &Path, units: u64) -> io::Result<Prepared> {
     std::fs::create_dir_all(folder)?;
-    let lock = File::create(folder.join("lock"))?;
+    if !is_cache(folder)? {
+        return Ok(Prepared::Foreign);
+    }
+    let lock = File::create(folder.join(LOCK))?;
     match lock.try_lock() {
         Ok(()) => {}
-        Err(std::fs::TryLockError::WouldBlock) => return Ok(None),
+        Err(std::fs::TryLockError::WouldBlock) => return Ok(Prepared::Taken),
         Err(std::fs::TryLockError::Error(error)) => return Err(error),
     }
+    std::fs::write(
+        folder.join(MARKER),
+        "blocks of voxels that Saccade has stitched\n",
+    )?;
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
         let name = entry.file_name();
@@ -206,11 +262,8 @@ fn prepare(folder: &Path, units: u64) -> io::Result<Option<File>> {
             std::fs::remove_file(entry.path())?;
         }
     }
-    Ok(Some(lock))
+    Ok(Prepared::Ours(lock))
 }
-
-/// Name of the object that tells one archive from another that took its place.
-const IDENTITY: &str = "identity";
 
 /// What tells an archive from every other, made if it has none; `None` where it cannot be written.
 pub(super) async fn identity(storage: &dyn Storage) -> Option<Bytes> {

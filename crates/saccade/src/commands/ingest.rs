@@ -13,6 +13,7 @@ use saccade_ingest::ingest::{IngestOptions, Summary, run};
 use saccade_ingest::watch::{self, Disk, Pattern, Watch, WatchConfig};
 
 use crate::arguments::{Archive, extent, pitch, scale, volume_name, voxel_nm};
+use crate::folders::overlap;
 use crate::interrupt::cancel_when_interrupted;
 use crate::open::waited_for;
 use crate::progress::Shown;
@@ -143,23 +144,8 @@ impl Stored {
 
 /// The acquisition archive is only read: nothing is made in or around it.
 fn refuse_same_folder(acquisition: &Path, archive: &Path) -> Result<()> {
-    let Ok(theirs) = acquisition.canonicalize() else {
-        return Ok(());
-    };
-    // The archive may not exist yet; its nearest parent that does tells where it would be.
-    let mut existing = std::path::absolute(archive)?;
-    let mut missing = PathBuf::new();
-    while !existing.exists() {
-        let name = existing.file_name().unwrap_or_default().to_owned();
-        missing = Path::new(&name).join(missing);
-        if !existing.pop() {
-            break;
-        }
-    }
-    let ours = existing.canonicalize()?.join(missing);
-    let within = ours.starts_with(&theirs) || (ours.exists() && theirs.starts_with(&ours));
     anyhow::ensure!(
-        !within,
+        !overlap(acquisition, archive)?,
         "the microscope's folder is only read: name another folder for the archive than {}",
         archive.display()
     );

@@ -30,6 +30,31 @@ async fn options(folder: &Path) -> StitchedOptions {
     }
 }
 
+#[test]
+fn a_folder_of_something_else_is_left_alone() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let (thesis, cache) = (
+            folder.path().join("thesis.tex"),
+            folder.path().join("cache"),
+        );
+        std::fs::write(&thesis, "chapter 1").unwrap();
+        let refused = DiskCache::open(folder.path(), 0).await;
+        assert!(
+            matches!(refused, Err(DiskCacheError::Foreign { .. })),
+            "{refused:?}"
+        );
+        let files = std::fs::read_dir(folder.path()).unwrap().count();
+        assert_eq!(files, 1, "nothing was written");
+        // A cache stays one, whatever somebody puts into it, also one that has no marker yet.
+        DiskCache::open(&cache, 0).await.unwrap().close().await;
+        std::fs::remove_file(cache.join("saccade-disk-cache")).unwrap();
+        DiskCache::open(&cache, 0).await.unwrap().close().await;
+        std::fs::write(cache.join("notes"), "mine").unwrap();
+        DiskCache::open(&cache, 0).await.unwrap().close().await;
+    });
+}
+
 async fn fill(fixture: &Fixture, folder: &Path) -> u64 {
     let mut options = options(folder).await;
     let source = fixture.open_with(options.clone()).await;
