@@ -5,5 +5,5 @@ mod refusal;
 mod tag;
 
 pub(crate) use range::{Requested, requested};
-pub(crate) use refusal::{Refusal, internal, not_found, refusal, try_again};
+pub(crate) use refusal::{Refusal, cause, failing, not_found, refusal, try_again};
 pub(crate) use tag::{Tag, mark_encoding};

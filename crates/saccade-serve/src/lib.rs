@@ -69,5 +69,5 @@ mod volumes;
 
 pub use archive::{OfferError, follow_archive, offer_archive};
 pub use server::{Access, Compress, Limits, Options, Origins, ServeError, Server};
-pub use status::{CatalogStatus, Quarantined, Status, StatusError, StatusSource};
+pub use status::{CatalogStatus, DamagedTile, Quarantined, Status, StatusError, StatusSource};
 pub use volumes::Volumes;

@@ -15,7 +15,7 @@ use saccade_core::voxel_box::VoxelBox;
 use saccade_source::{Chunk, ChunkError, ChunkId};
 
 use crate::formats::Piece;
-use crate::http::{Requested, Tag, internal, not_found, requested, try_again};
+use crate::http::{Requested, Tag, cause, failing, not_found, requested, try_again};
 use crate::server::Compressible;
 use crate::volumes::Published;
 
@@ -139,11 +139,13 @@ pub(crate) fn failed(published: &Published, error: &ChunkError) -> Response {
         ChunkError::NotReady { retry_after, .. } => try_again(error.to_string(), *retry_after),
         other => {
             log::warn!("volume {:?}: {}", published.volume().name, chain(other));
-            if other.is_transient() {
-                try_again(other.to_string(), Duration::from_secs(1))
-            } else {
-                internal(other.to_string())
-            }
+            let after = other.is_transient().then_some(Duration::from_secs(1));
+            let after = other.retry_after().or(after);
+            let cause = match other {
+                ChunkError::Failed { source, .. } => cause(&**source),
+                other => other.to_string(),
+            };
+            failing(other.to_string(), cause, after)
         }
     }
 }

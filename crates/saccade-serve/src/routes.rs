@@ -27,7 +27,7 @@ use crate::api::{Document, RangeList, VolumeDescription, VolumeEntry, VolumeList
 use crate::assets::asset;
 use crate::events;
 use crate::formats::{Entry, Format, Unknown};
-use crate::http::{Refusal, internal, mark_encoding, not_found, refusal, try_again};
+use crate::http::{Refusal, cause, failing, mark_encoding, not_found, refusal, try_again};
 use crate::index::index;
 use crate::pieces::piece;
 use crate::server::{Compress, Compressible, Gate, Options, Origins};
@@ -214,7 +214,8 @@ pub(crate) async fn volume(State(app): State<App>, Path(name): Path<String>) -> 
     responses(
         (status = 200, body = Status),
         (status = 404, body = Refusal, description = "no such volume"),
-        (status = 500, body = Refusal, description = "the catalog cannot be read")
+        (status = 500, body = Refusal, description = "the catalog cannot be read"),
+        (status = 503, body = Refusal, description = "the catalog cannot be used now; ask again after Retry-After")
     )
 )]
 pub(crate) async fn status(State(app): State<App>, Path(name): Path<String>) -> Response {
@@ -225,14 +226,20 @@ pub(crate) async fn status(State(app): State<App>, Path(name): Path<String>) -> 
     match &published.status {
         None => {
             let revision = published.history().revision();
-            described(Status {
+            let status = Status {
                 revision,
                 ..Status::default()
-            })
+            };
+            described(status.with_damage(published.source.damage()))
         }
         Some(source) => match source.status().await {
-            Ok(status) => described(status),
-            Err(error) => internal(error.to_string()),
+            Ok(status) => described(status.with_damage(published.source.damage())),
+            Err(error) => {
+                let cause = cause(&*error.source);
+                log::warn!("{error}: {}", error.source);
+                let after = error.transient.then_some(Duration::from_secs(1));
+                failing(error.to_string(), cause, after)
+            }
         },
     }
 }

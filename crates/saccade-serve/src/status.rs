@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use futures::future::BoxFuture;
 use saccade_archive::catalog::{Catalog, CatalogError};
+use saccade_source::Damage;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -22,6 +23,43 @@ pub struct Status {
     pub early_transforms: Option<u64>,
     /// Files that could not be taken in.
     pub quarantined: Vec<Quarantined>,
+    /// Tiles that were taken in, and could not be read when the server looked at them last.
+    #[serde(default)]
+    pub damaged: u64,
+    /// The first hundred of them.
+    #[serde(default)]
+    pub damaged_tiles: Vec<DamagedTile>,
+}
+
+/// A tile that cannot be read any more.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct DamagedTile {
+    /// Section: z index of the volume.
+    pub section: u32,
+    /// Name of its pyramid in the archive.
+    pub object: String,
+    /// What is wrong and how to mend it, in words for people.
+    pub reason: String,
+}
+
+/// Damaged tiles that are listed.
+const LISTED: usize = 100;
+
+impl Status {
+    /// The same, with what a source could not read.
+    #[must_use]
+    pub fn with_damage(self, damage: Vec<Damage>) -> Self {
+        let tile = |damage: Damage| DamagedTile {
+            section: damage.section,
+            object: damage.object,
+            reason: damage.reason,
+        };
+        Self {
+            damaged: damage.len() as u64,
+            damaged_tiles: damage.into_iter().take(LISTED).map(tile).collect(),
+            ..self
+        }
+    }
 }
 
 /// A file set aside.
@@ -43,6 +81,8 @@ pub struct StatusError {
     pub source: Arc<dyn std::error::Error + Send + Sync>,
     /// Name of the volume.
     pub volume: String,
+    /// Whether it may be told later.
+    pub transient: bool,
 }
 
 /// Knows the state of one volume.
@@ -86,6 +126,7 @@ impl CatalogStatus {
             waiting: Some(statistics.waiting),
             early_transforms: Some(statistics.early),
             quarantined: quarantined.into_iter().map(file).collect(),
+            ..Status::default()
         })
     }
 }
@@ -94,6 +135,7 @@ impl StatusSource for CatalogStatus {
     fn status(&self) -> BoxFuture<'_, Result<Status, StatusError>> {
         Box::pin(async {
             self.read().await.map_err(|error| StatusError {
+                transient: error.is_transient(),
                 source: Arc::new(error),
                 volume: self.volume.clone(),
             })

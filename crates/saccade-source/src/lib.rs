@@ -48,6 +48,6 @@ pub mod workers;
 pub mod zarr;
 
 pub use source::{
-    Change, ChangeReason, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource,
+    Change, ChangeReason, Chunk, ChunkError, ChunkId, Damage, SourceError, ValueRange, VolumeSource,
 };
 pub use stored::PieceError;

@@ -10,6 +10,7 @@ mod status;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::StreamExt;
 use futures::future::{AbortHandle, Abortable, Either, select};
 use reqwest::{Client, StatusCode, Url};
 use saccade_core::volume::Volume;
@@ -74,10 +75,12 @@ pub enum RemoteError {
         url: Url,
     },
     /// The server answered, but not with what was asked for.
-    #[error("the server answered {status} for {url}")]
+    #[error("the server answered {status} for {url}{}", said(reason.as_deref()))]
     Status {
         /// Its answer.
         status: StatusCode,
+        /// What it says is wrong, if it is a Saccade server.
+        reason: Option<String>,
         /// What was asked for.
         url: Url,
     },
@@ -326,6 +329,42 @@ fn joined(url: &Url, parts: &[&str]) -> Url {
     url
 }
 
+/// What a server says where it cannot do what is asked for.
+#[derive(Default, Deserialize)]
+struct RefusalJson {
+    #[serde(default)]
+    error: Option<String>,
+    /// What is wrong, where the request is not.
+    #[serde(default)]
+    cause: Option<String>,
+}
+
+impl RefusalJson {
+    fn reason(self) -> Option<String> {
+        self.cause.or(self.error)
+    }
+}
+
+/// Longest refusal that is read \[bytes\].
+const LONGEST_REFUSAL: usize = 64 << 10;
+
+/// What a refusal says; nothing where it is not a Saccade server's.
+async fn refusal(answer: reqwest::Response) -> RefusalJson {
+    let mut bytes = Vec::new();
+    let mut body = answer.bytes_stream();
+    while let Some(Ok(more)) = body.next().await {
+        bytes.extend_from_slice(&more);
+        if bytes.len() > LONGEST_REFUSAL {
+            return RefusalJson::default();
+        }
+    }
+    serde_json::from_slice(&bytes).unwrap_or_default()
+}
+
+fn said(reason: Option<&str>) -> String {
+    reason.map_or_else(String::new, |reason| format!(": {reason}"))
+}
+
 async fn get_json<T: DeserializeOwned>(
     client: &Client,
     url: Url,
@@ -342,6 +381,7 @@ async fn get_json<T: DeserializeOwned>(
             let status = answer.status();
             return Err(RemoteError::Status {
                 status,
+                reason: refusal(answer).await.reason(),
                 url: url.clone(),
             });
         }

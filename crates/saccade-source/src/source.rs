@@ -67,6 +67,17 @@ pub struct ValueRange {
     pub max: u16,
 }
 
+/// A part of a volume that is lost until somebody mends it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Damage {
+    /// Section: z index of the volume.
+    pub section: u32,
+    /// Name of what cannot be read, within the volume's storage.
+    pub object: String,
+    /// What is wrong and how to mend it, in words for people.
+    pub reason: String,
+}
+
 /// Why a chunk could not be delivered.
 #[derive(Clone, Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -85,6 +96,16 @@ pub enum ChunkError {
         /// When to ask again.
         retry_after: Duration,
     },
+    /// Something is in the way that may pass, as the server that reads it says; ask again.
+    #[error("{id} could not be read: {reason}")]
+    Hindered {
+        /// What was asked for.
+        id: ChunkId,
+        /// When to ask again.
+        retry_after: Duration,
+        /// What is wrong, in words for people.
+        reason: String,
+    },
     /// Reading or building failed; see the source.
     #[error("{id} could not be read")]
     Failed {
@@ -102,7 +123,7 @@ impl ChunkError {
     pub fn is_transient(&self) -> bool {
         match self {
             Self::OutOfRange { .. } => false,
-            Self::NotReady { .. } => true,
+            Self::NotReady { .. } | Self::Hindered { .. } => true,
             Self::Failed { transient, .. } => *transient,
         }
     }
@@ -110,7 +131,9 @@ impl ChunkError {
     /// When the source wants to be asked again, if it says so.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
-            Self::NotReady { retry_after, .. } => Some(*retry_after),
+            Self::NotReady { retry_after, .. } | Self::Hindered { retry_after, .. } => {
+                Some(*retry_after)
+            }
             Self::OutOfRange { .. } | Self::Failed { .. } => None,
         }
     }
@@ -186,6 +209,12 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
     /// begins now sees that revision or a later one. 0 where nobody counts.
     fn revision(&self) -> u64 {
         0
+    }
+
+    /// What could not be read when it was looked at last and will not get better by itself, as far as this
+    /// source knows and has looked.
+    fn damage(&self) -> Vec<Damage> {
+        Vec::new()
     }
 
     /// Bounds of a chunk's measured values, if they are at hand.

@@ -53,6 +53,7 @@ mod blocks;
 mod build;
 mod canvas;
 mod coverage;
+mod damage;
 mod disk_cache;
 mod error;
 mod follow;
@@ -76,7 +77,7 @@ use tokio::task::AbortHandle;
 
 use crate::changes::Changes;
 use crate::maybe_send::{BoxFuture, BoxStream};
-use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource};
+use crate::{Change, Chunk, ChunkError, ChunkId, Damage, SourceError, ValueRange, VolumeSource};
 use block::{BlockGrid, CutChunk};
 use blocks::Blocks;
 use build::{Builder, Place, Rules};
@@ -350,6 +351,10 @@ impl VolumeSource for StitchedSource {
 
     fn revision(&self) -> u64 {
         self.inner.changes.revision()
+    }
+
+    fn damage(&self) -> Vec<Damage> {
+        self.inner.builder.tiles().damaged().list()
     }
 
     /// Known of chunks that were built and are still held; see [`Self::find_value_range`] for others.

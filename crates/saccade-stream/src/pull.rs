@@ -371,7 +371,7 @@ impl Pull {
                 let until = now + self.limits.retry.delay(attempts, asked);
                 self.backoff.insert(key(id), Backoff { until, attempts });
                 // A source that asks for patience has not failed.
-                if asked.is_none() {
+                if !matches!(error, ChunkError::NotReady { .. }) {
                     self.failure = Some((id, in_words(&error)));
                 }
             }

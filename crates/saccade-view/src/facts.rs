@@ -168,6 +168,18 @@ fn of_acquisition(acquisition: &Acquisition) -> Vec<Piece> {
         bad.more = Some(named.join("\n"));
         pieces.push(bad);
     }
+    if acquisition.damaged > 0 {
+        let text = format!("{} cannot be read", count(acquisition.damaged, "tile"));
+        let mut bad = piece(Tone::Bad, text);
+        let named = acquisition.damaged_tiles.iter().take(MAX_NAMED);
+        let mut named: Vec<String> = named.map(|tile| tile.reason.clone()).collect();
+        let more = acquisition.damaged.saturating_sub(named.len() as u64);
+        if more > 0 {
+            named.push(format!("and {more} more"));
+        }
+        bad.more = Some(named.join("\n"));
+        pieces.push(bad);
+    }
     pieces
 }
 
@@ -367,6 +379,7 @@ mod tests {
             tiles: Some(1),
             sections: Some(3),
             quarantined: (0..20).map(file).collect(),
+            ..Acquisition::default()
         };
         let status = complete();
         let text = text(&status, false, Some(&acquisition));
@@ -384,6 +397,32 @@ mod tests {
             more.starts_with("t0.tif: 16 bit\n") && more.ends_with("and 8 more"),
             "{more}"
         );
+    }
+
+    #[test]
+    fn tiles_that_cannot_be_read_are_counted_and_explained() {
+        let tile = saccade_source::Damage {
+            section: 3,
+            object: "tiles/v/000003/a.tif".to_owned(),
+            reason: "the pyramid is missing".to_owned(),
+        };
+        let acquisition = Acquisition {
+            damaged: 3,
+            damaged_tiles: vec![tile.clone(), tile],
+            ..Acquisition::default()
+        };
+        let facts = Facts {
+            status: &complete(),
+            preview: false,
+            acquisition: Some(&acquisition),
+        };
+        let last = line(&facts).pop().unwrap();
+        assert_eq!(
+            (last.tone, &*last.text),
+            (Tone::Bad, "3 tiles cannot be read")
+        );
+        let more = last.more.unwrap();
+        assert!(more.starts_with("the pyramid is missing\n") && more.ends_with("and 1 more"));
     }
 
     #[test]

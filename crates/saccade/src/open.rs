@@ -7,13 +7,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
-use saccade_archive::{ArchiveError, StorageLocation, VisualizationArchive};
+use saccade_archive::catalog::CatalogError;
+use saccade_archive::{
+    ArchiveError, ArchiveLocation, CatalogLocation, StorageLocation, VisualizationArchive,
+};
 use saccade_serve::{CatalogStatus, StatusSource};
+use saccade_source::export;
 use saccade_source::objects::Location;
 use saccade_source::remote::{Quarantined, RemoteError, RemoteSource, Status, volumes};
 use saccade_source::stitched::StitchedSource;
 use saccade_source::zarr::ZarrSource;
-use saccade_source::{SourceError, VolumeSource, images};
+use saccade_source::{Damage, SourceError, VolumeSource, images};
 use saccade_view::AcquisitionReader;
 
 use crate::arguments::CatalogArgument;
@@ -23,33 +27,63 @@ use crate::stitching::Stitching;
 /// Between attempts to open an archive whose catalog's server is away.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
-/// Opens an archive for work that goes on for months. While the server of its catalog is away, waits for it, and
-/// says so.
+/// Opens an archive for work that goes on for months. While the server of its catalog is away, or has no catalog
+/// yet, waits for it, and says so.
 pub(crate) async fn waited_for<F>(mut open: impl FnMut() -> F) -> Result<VisualizationArchive>
 where
     F: Future<Output = Result<VisualizationArchive, ArchiveError>>,
 {
-    let mut waits = false;
+    let mut waits_for = None;
     loop {
         match open().await {
-            Err(ArchiveError::Catalog(error)) if error.is_outage() => {
-                if !waits {
+            Err(ArchiveError::Catalog(error)) if passes(&error) => {
+                // Once for each reason.
+                let what = error.to_string();
+                if waits_for.as_ref() != Some(&what) {
                     let reason = error.source().map_or(String::new(), |e| format!(" ({e})"));
                     say(&format!(
-                        "{error}{reason}; trying again until it can be used"
+                        "{what}{reason}; trying again until it can be used"
                     ));
                 }
-                waits = true;
+                waits_for = Some(what);
                 tokio::time::sleep(TRY_AGAIN).await;
             }
             opened => {
-                if waits && opened.is_ok() {
+                if waits_for.is_some() && opened.is_ok() {
                     say("the catalog can be used now");
                 }
                 return Ok(opened?);
             }
         }
     }
+}
+
+/// Whether the catalog will be there some time, without this command being given again. A database was made for
+/// a catalog; a folder without one is rather the wrong folder.
+fn passes(error: &CatalogError) -> bool {
+    let empty = matches!(
+        error,
+        CatalogError::NotFound {
+            location: CatalogLocation::Postgres(_)
+        }
+    );
+    empty || error.is_outage()
+}
+
+/// Refuses what an export has left that is not whole, which is neither an image nor an archive.
+fn refuse_half_export(location: &ArchiveLocation) -> Result<()> {
+    let begun = |folder: &Path| {
+        folder.join(export::UNFINISHED).is_file()
+            && !folder.join(VisualizationArchive::CATALOG).exists()
+    };
+    if let Some(folder) = location.folder().filter(|folder| begun(folder)) {
+        bail!(
+            "an export to this folder was begun and is not whole yet: wait for it, or repeat the command, \
+             which goes on with it: {}",
+            folder.display()
+        );
+    }
+    Ok(())
 }
 
 /// Where a volume is.
@@ -182,8 +216,9 @@ impl Place {
                 opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for")
             }
             Self::Bucket(storage, _) | Self::Archive(storage) => {
-                let location = catalog.location(storage.clone())?;
+                let location = Self::archive(storage, catalog)?;
                 let archive = VisualizationArchive::open(&location).await?;
+                let options = stitching.options(&location).await?;
                 let name = match name {
                     Some(name) => name.to_owned(),
                     None => match archive.catalog().volumes().await?.into_iter().next() {
@@ -193,17 +228,23 @@ impl Place {
                         ),
                     },
                 };
-                let options = stitching.options().await;
                 let source = StitchedSource::open(&archive, &name, options)
                     .await
                     .with_context(|| format!("cannot open a volume of {location}"))?;
                 let status = CatalogStatus::new(archive.catalog().clone(), &name);
-                let acquisition: AcquisitionReader = Arc::new(move || {
-                    let status = status.clone();
-                    Box::pin(async move { status.status().await.ok().map(told) })
+                let source: Arc<dyn VolumeSource> = Arc::new(source);
+                let acquisition: AcquisitionReader = Arc::new({
+                    let source = source.clone();
+                    move || {
+                        let (status, source) = (status.clone(), source.clone());
+                        Box::pin(async move {
+                            let status = status.status().await.ok()?;
+                            Some(told(status.with_damage(source.damage())))
+                        })
+                    }
                 });
                 Ok(Opened {
-                    source: Arc::new(source),
+                    source,
                     acquisition: Some(acquisition),
                 })
             }
@@ -241,6 +282,16 @@ impl Place {
         }
     }
 
+    /// Where an archive is.
+    pub(crate) fn archive(
+        storage: &StorageLocation,
+        catalog: &CatalogArgument,
+    ) -> Result<ArchiveLocation> {
+        let location = catalog.location(storage.clone())?;
+        refuse_half_export(&location)?;
+        Ok(location)
+    }
+
     /// What an archive is stored in.
     pub(crate) fn storage(&self) -> Option<&StorageLocation> {
         match self {
@@ -257,10 +308,17 @@ fn told(status: saccade_serve::Status) -> Status {
         tile: q.tile,
         reason: q.reason,
     };
+    let tile = |tile: saccade_serve::DamagedTile| Damage {
+        section: tile.section,
+        object: tile.object,
+        reason: tile.reason,
+    };
     Status {
         revision: status.revision,
         tiles: status.tiles,
         sections: status.sections,
         quarantined: status.quarantined.into_iter().map(file).collect(),
+        damaged: status.damaged,
+        damaged_tiles: status.damaged_tiles.into_iter().map(tile).collect(),
     }
 }

@@ -5,10 +5,12 @@ use std::time::Duration;
 
 use futures::StreamExt;
 use reqwest::StatusCode;
+use saccade_archive::catalog::{CatalogError, CatalogLocation};
 use saccade_core::volume::Volume;
-use saccade_serve::{Options, ServeError, Server};
+use saccade_serve::{Options, ServeError, Server, Status, StatusError, StatusSource, Volumes};
 use saccade_source::maybe_send::{BoxFuture, BoxStream};
-use saccade_source::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
+use saccade_source::stitched::StitchError;
+use saccade_source::{Change, Chunk, ChunkError, ChunkId, Damage, VolumeSource};
 use serde_json::Value;
 
 use super::{header, run, serve, serve_source, volume};
@@ -37,6 +39,91 @@ impl VolumeSource for Troubled {
     fn changes(&self) -> BoxStream<'static, Change> {
         futures::stream::pending().boxed()
     }
+
+    fn damage(&self) -> Vec<Damage> {
+        let damage = |n| Damage {
+            section: n,
+            object: format!("tiles/{n}"),
+            reason: "it is missing".to_owned(),
+        };
+        (0..123).map(damage).collect()
+    }
+}
+
+/// Where the server keeps its things, which is nobody's business.
+const SECRET: &str = "/srv/secret/catalog.sqlite";
+
+fn full() -> CatalogError {
+    CatalogError::ReadOnly {
+        location: CatalogLocation::File(SECRET.into()),
+    }
+}
+
+/// A catalog that cannot be used.
+struct NoStatus;
+
+impl StatusSource for NoStatus {
+    fn status(&self) -> BoxFuture<'_, Result<Status, StatusError>> {
+        Box::pin(async {
+            Err(StatusError {
+                source: Arc::new(full()),
+                volume: "em".to_owned(),
+                transient: true,
+            })
+        })
+    }
+}
+
+/// What is wrong is said to who asks, and not where.
+#[test]
+fn failures_name_their_cause_and_no_place() {
+    run(async {
+        saccade_archive::tls::provide();
+        let source = Arc::new(Troubled {
+            volume: Arc::new(volume()),
+            trouble: |id| {
+                let source = StitchError::Catalog { source: full() };
+                Some(ChunkError::Failed {
+                    id,
+                    transient: false,
+                    source: Arc::new(source),
+                })
+            },
+        });
+        let (volumes, server) = (Volumes::new(), Server::bind(([127, 0, 0, 1], 0).into()));
+        volumes.publish(source.clone(), Some(Arc::new(NoStatus)));
+        let server = server.await.unwrap();
+        let url = server.url();
+        let running = server.run(volumes.clone(), Options::DEFAULT, std::future::pending());
+        let running = tokio::spawn(running);
+        let get = async |path: &str| {
+            let response = reqwest::get(format!("{url}v/em/{path}")).await.unwrap();
+            let status = response.status();
+            let text = response.text().await.unwrap();
+            assert!(!text.contains("secret"), "{text}");
+            (status, serde_json::from_str::<Value>(&text).unwrap())
+        };
+        for (path, expected) in [
+            ("status.json", StatusCode::SERVICE_UNAVAILABLE),
+            ("zarr/0/c/0/0/0/0", StatusCode::INTERNAL_SERVER_ERROR),
+        ] {
+            let (status, refusal) = get(path).await;
+            assert_eq!(status, expected);
+            let cause = refusal["cause"].as_str().unwrap();
+            assert!(
+                cause.contains("may only be read: check the permissions"),
+                "{cause}"
+            );
+        }
+        // Damage is counted, and the first of it listed.
+        volumes.publish(source, None);
+        let (_, status) = get("status.json").await;
+        assert_eq!(status["damaged"], 123);
+        let listed = status["damaged_tiles"].as_array().unwrap();
+        assert_eq!(listed.len(), 100);
+        assert_eq!(listed[7]["object"], "tiles/7");
+        running.abort();
+    });
 }
 
 /// A source whose reads never end.

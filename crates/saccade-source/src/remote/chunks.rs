@@ -8,7 +8,7 @@ use futures::StreamExt;
 use reqwest::{StatusCode, Url, header};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::{RemoteError, RemoteSource, joined, within};
+use super::{RemoteError, RemoteSource, joined, refusal, within};
 use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId};
 
 /// When to ask again, where the server does not say.
@@ -60,7 +60,8 @@ impl Revisions {
 enum Answer {
     Voxels(Bytes),
     Empty,
-    Later(Duration),
+    /// Ask again; with what is wrong, if anything is.
+    Later(Duration, Option<String>),
 }
 
 impl RemoteSource {
@@ -74,7 +75,12 @@ impl RemoteSource {
         match self.get(url).await {
             Ok(Answer::Voxels(bytes)) => Ok(Chunk::Voxels(bytes)),
             Ok(Answer::Empty) => Ok(Chunk::Empty),
-            Ok(Answer::Later(retry_after)) => Err(ChunkError::NotReady { id, retry_after }),
+            Ok(Answer::Later(retry_after, None)) => Err(ChunkError::NotReady { id, retry_after }),
+            Ok(Answer::Later(retry_after, Some(reason))) => Err(ChunkError::Hindered {
+                id,
+                retry_after,
+                reason,
+            }),
             Err(error) => Err(ChunkError::Failed {
                 id,
                 transient: error.is_transient(),
@@ -95,11 +101,18 @@ impl RemoteSource {
             StatusCode::OK => {}
             StatusCode::NOT_FOUND => return Ok(Answer::Empty),
             StatusCode::SERVICE_UNAVAILABLE | StatusCode::TOO_MANY_REQUESTS => {
-                return Ok(Answer::Later(retry_after(answer.headers())));
+                let retry_after = retry_after(answer.headers());
+                let cause = within(idle, &url, refusal(answer)).await?.cause;
+                return Ok(Answer::Later(retry_after, cause));
             }
             status => {
+                let reason = within(idle, &url, refusal(answer)).await?.reason();
                 let url = url.clone();
-                return Err(RemoteError::Status { status, url });
+                return Err(RemoteError::Status {
+                    status,
+                    reason,
+                    url,
+                });
             }
         }
         let expected = self.chunk_bytes;

@@ -9,7 +9,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::chunks::Revisions;
 use super::event_parser::{Event, EventParser};
-use super::{RemoteError, RemoteOptions, joined, within};
+use super::{RemoteError, RemoteOptions, joined, refusal, within};
 use crate::changes::Changes;
 use crate::maybe_send::sleep;
 use crate::{Change, ChangeReason};
@@ -70,7 +70,12 @@ impl Follower {
         let answer = within(idle, &url, request.send()).await?.map_err(http)?;
         if !answer.status().is_success() {
             let status = answer.status();
-            return Err(RemoteError::Status { status, url });
+            let reason = within(idle, &url, refusal(answer)).await?.reason();
+            return Err(RemoteError::Status {
+                status,
+                reason,
+                url,
+            });
         }
         let mut parser = EventParser::default();
         let mut body = answer.bytes_stream();

@@ -1,6 +1,8 @@
 use reqwest::Client;
 use serde::Deserialize;
 
+use crate::Damage;
+
 use super::{RemoteError, RemoteOptions, RemoteSource, Url, get_json, joined};
 
 /// How the acquisition of a volume is coming along, as its server knows it.
@@ -14,6 +16,12 @@ pub struct Status {
     pub sections: Option<u64>,
     /// Files that could not be taken in.
     pub quarantined: Vec<Quarantined>,
+    /// Tiles that were taken in and could not be read when they were looked at last.
+    #[serde(default)]
+    pub damaged: u64,
+    /// The first of them.
+    #[serde(default)]
+    pub damaged_tiles: Vec<Damage>,
 }
 
 /// A file set aside.

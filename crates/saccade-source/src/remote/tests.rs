@@ -216,6 +216,45 @@ fn waits_as_long_as_it_is_told() {
     });
 }
 
+/// A server that is busy is one thing, one that cannot do its work another.
+#[test]
+fn what_a_server_says_is_wrong_is_passed_on() {
+    const AWAY: &str = r#"{"error": "not read", "cause": "the catalog's server does not answer"}"#;
+    run(async {
+        let (server, remote) = start().await;
+        let refuse = |status, body| {
+            let mut faults = server.faults.lock().unwrap();
+            faults.push_back(Fault::Refusal(status, body));
+        };
+        refuse("503 Service Unavailable\r\nretry-after: 7", AWAY);
+        let error = remote.read(FIRST).await.unwrap_err();
+        assert!(error.is_transient(), "{error}");
+        assert_eq!(error.retry_after(), Some(Duration::from_secs(7)));
+        let told = error.to_string();
+        assert!(
+            told.ends_with("the catalog's server does not answer"),
+            "{told}"
+        );
+
+        refuse(
+            "503 Service Unavailable",
+            r#"{"error": "the server is busy"}"#,
+        );
+        let error = remote.read(FIRST).await.unwrap_err();
+        assert!(matches!(error, ChunkError::NotReady { .. }), "{error}");
+
+        refuse("500 Internal Server Error", AWAY);
+        let ChunkError::Failed { source, .. } = remote.read(FIRST).await.unwrap_err() else {
+            panic!("a failure")
+        };
+        let told = source.to_string();
+        assert!(
+            told.contains("500") && told.contains("server does not answer"),
+            "{told}"
+        );
+    });
+}
+
 #[test]
 fn silence_fails_after_a_while() {
     run(async {

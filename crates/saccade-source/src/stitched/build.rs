@@ -441,7 +441,10 @@ impl Builder {
                     Ok(image) => {
                         candidates.push(Candidate::new(tile, image, of_pyramid, rules.labels));
                     }
-                    Err(error) => failures.push(Failure::bounds(error, &tile, level, voxels)),
+                    Err(error) => {
+                        self.tiles.damaged().note(&tile, &error);
+                        failures.push(Failure::bounds(error, &tile, level, voxels));
+                    }
                 }
             }
             let covered = on_rayon(move || cover(&grid, rules.overlaps, uncovered, candidates));
@@ -478,8 +481,13 @@ impl Builder {
             let mut canvas = Canvas::<S>::new(grid, by, rules);
             for (part, fetched) in fetched {
                 let drawn = fetched.and_then(|fetched| canvas.draw(&tiles, &part, fetched));
-                if let Err(error) = drawn {
-                    failures.push(Failure::segments(error, &part.segments, by));
+                let tile = &part.candidate.tile;
+                match drawn {
+                    Ok(()) => tiles.damaged().clear(tile),
+                    Err(error) => {
+                        tiles.damaged().note(tile, &error);
+                        failures.push(Failure::segments(error, &part.segments, by));
+                    }
                 }
             }
             Slice {

@@ -1,5 +1,6 @@
 use saccade_archive::catalog::CatalogError;
 use saccade_archive::pyramid::PyramidError;
+use saccade_archive::storage::StorageError;
 use saccade_core::volume::Dtype;
 
 /// Why a block, or the part of it that a tile covers, could not be built.
@@ -65,6 +66,40 @@ pub enum StitchError {
 }
 
 impl StitchError {
+    /// What is wrong and how to mend it, without saying where the archive is: for those who only look.
+    pub fn without_place(&self) -> String {
+        match self {
+            Self::Catalog { source } => format!("{self}: {}", source.without_place()),
+            Self::Tile {
+                source: PyramidError::Storage { source, name },
+                section,
+            } => match source {
+                StorageError::NotFound { .. } => format!(
+                    "the pyramid of a tile of section {section} is missing; `saccade check ARCHIVE --repair` \
+                     has it made anew: {name}"
+                ),
+                other => format!("{self}: {}: {name}", other.without_place()),
+            },
+            Self::Tile { source, .. } => format!("{self}: {source}"),
+            Self::Size { .. } | Self::Dtype { .. } | Self::Cut { .. } | Self::Stopped { .. } => {
+                self.to_string()
+            }
+        }
+    }
+
+    /// Whether a tile's pyramid is not as it should be; else what holds the tiles cannot be used, or there is
+    /// no time.
+    pub(super) fn is_damage(&self) -> bool {
+        match self {
+            Self::Tile {
+                source: PyramidError::Storage { source, .. },
+                ..
+            } => !source.is_outage(),
+            Self::Tile { .. } | Self::Size { .. } | Self::Dtype { .. } | Self::Cut { .. } => true,
+            Self::Catalog { .. } | Self::Stopped { .. } => false,
+        }
+    }
+
     /// Whether the same request may succeed later, without the tile being ingested again.
     pub fn is_transient(&self) -> bool {
         match self {

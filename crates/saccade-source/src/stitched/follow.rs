@@ -51,6 +51,7 @@ async fn catch_up(
                     return Ok(());
                 };
                 inner.builder.tiles().index().reload().await?;
+                inner.builder.tiles().damaged().forget(|_| true);
                 inner.tell_missed(revision);
                 *seen = revision;
                 continue;
@@ -63,6 +64,8 @@ async fn catch_up(
         // First what is known, then what was built of it, then the news: whoever reads after the
         // news gets neither.
         let turned = inner.builder.tiles().index().apply(&changes).await;
+        let changed = |section| changes.iter().any(|change| change.section == section);
+        inner.builder.tiles().damaged().forget(changed);
         let told = changes.iter().map(|change| {
             let all = turned.contains(&change.section);
             Change {

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::StitchedOptions;
+use super::damage::DamagedTiles;
 use super::disk_cache::DiskCache;
 use super::error::StitchError;
 use super::index::{IndexedTile, TileIndex};
@@ -200,6 +201,7 @@ pub(super) struct Tiles {
     from_disk: AtomicU64,
     next_serial: AtomicU64,
     decoded: AtomicU64,
+    damaged: DamagedTiles,
 }
 
 impl Tiles {
@@ -240,12 +242,18 @@ impl Tiles {
             from_disk: AtomicU64::new(0),
             next_serial: AtomicU64::new(0),
             decoded: AtomicU64::new(0),
+            damaged: DamagedTiles::default(),
         }
     }
 
     /// Where they lie.
     pub(super) fn index(&self) -> &TileIndex {
         &self.index
+    }
+
+    /// Those that could not be read.
+    pub(super) fn damaged(&self) -> &DamagedTiles {
+        &self.damaged
     }
 
     /// What is drawn of a tile at a level of its pyramid.

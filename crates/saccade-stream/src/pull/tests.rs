@@ -209,7 +209,18 @@ fn passing_failures_are_repeated_with_growing_delays() {
         Some(now + ms(1000)),
         "the longer of both delays"
     );
-    let ticket = pull.plan(now + ms(1000)).start[0].ticket;
+    now += ms(1000);
+    let ticket = pull.plan(now).start[0].ticket;
+    let hindered = ChunkError::Hindered {
+        id,
+        retry_after: ms(900),
+        reason: "the server is away".to_owned(),
+    };
+    pull.answer(ticket, Err(hindered), now);
+    let failure = pull.progress().failure.unwrap();
+    assert!(failure.ends_with("the server is away"), "{failure}");
+    now += ms(1000);
+    let ticket = pull.plan(now).start[0].ticket;
     pull.answer(ticket, Ok(voxels()), now);
     assert_eq!(pull.state(brick(3)), BrickState::Ready);
     assert_eq!(pull.progress().failure, None, "it succeeded in the end");

@@ -91,7 +91,7 @@ impl Serve {
             return Ok(());
         }
         let storage = self.place.storage().context("there is no archive")?;
-        let location = self.catalog.location(storage.clone())?;
+        let location = Place::archive(storage, &self.catalog)?;
         let opened = waited_for(|| VisualizationArchive::open(&location));
         let archive = tokio::select! {
             archive = opened => archive?,
@@ -99,7 +99,7 @@ impl Serve {
         };
         let server = Server::bind(self.at.address()).await?;
         let volumes = Volumes::new();
-        let options = self.stitching.options().await;
+        let options = self.stitching.options(&location).await?;
         let disk_cache = options.disk_cache.clone();
         if offer_archive(&volumes, &archive, options.clone())
             .await?

@@ -427,6 +427,126 @@ fn words_that_make_no_sense() {
     assert_failed(&output, 1, &["the overlap is 0.9", "between"]);
 }
 
+/// A catalog and the pyramids of another archive; a cache on disk where other things are.
+#[test]
+fn what_does_not_belong_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let (one, other) = (folder.path().join("one"), folder.path().join("other"));
+    let (one, other) = (archive(&one), archive(&other));
+    let catalog = format!("{one}/catalog.sqlite");
+    let acquisition = folder.path().join("one/acquisition");
+    let strangers = ["not of one archive", &catalog, &other];
+    for arguments in [
+        &["serve", &other, "--port", "0"][..],
+        &["render", &other, "-o", "never.png"],
+        &["ingest", text(&acquisition), &other, "--once"],
+        &["check", &other],
+    ] {
+        let output = run(arguments.iter().chain(&["--catalog", &catalog]));
+        assert_failed(&output, 1, &strangers);
+    }
+
+    let thesis = folder.path().join("thesis");
+    std::fs::create_dir(&thesis).unwrap();
+    std::fs::write(thesis.join("thesis.tex"), "chapter 1").unwrap();
+    let within = format!("{one}/cache");
+    let caches: [(&str, &[&str]); 4] = [
+        (text(&thesis), &["other things", "thesis"]),
+        (&within, &["neither in the archive's folder", "cache"]),
+        (text(folder.path()), &["neither in the archive's folder"]),
+        (&one, &["neither in the archive's folder"]),
+    ];
+    for (cache, parts) in caches {
+        let output = run(["serve", &one, "--port", "0", "--disk-cache", cache]);
+        assert_failed(&output, 1, parts);
+    }
+    assert_eq!(std::fs::read_dir(&thesis).unwrap().count(), 1);
+    assert!(!Path::new(&within).exists());
+    for (size, part) in [
+        ("0", "at least"),
+        ("1.5 potatoes", "MB, GB or TB"),
+        ("1.2.3", "1.5"),
+    ] {
+        let sized = ["serve", "a", "--disk-cache", "b", "--disk-cache-size", size];
+        assert_failed(&run(sized), 2, &[part]);
+    }
+}
+
+#[test]
+fn what_an_export_finds_in_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let out = folder.path().join("out.zarr");
+    let export = |more: &[&str]| run(["export", &archive, text(&out)].iter().chain(more));
+    assert!(export(&[]).status.success());
+    let taken = export(&[]);
+    assert_failed(&taken, 1, &["something already", text(&out)]);
+
+    // As an export that was killed leaves it.
+    std::fs::remove_file(out.join("zarr.json")).unwrap();
+    let begun = r#"{"export": {"volume": "phantom", "channels": [0, 1]}, "revision": 1}"#;
+    std::fs::write(out.join("export.json"), begun).unwrap();
+    let other = export(&[]);
+    assert_failed(
+        &other,
+        1,
+        &["another export", "channels 0,1 there, 0 now", text(&out)],
+    );
+    assert!(stderr(&other).len() < 600, "{}", stderr(&other));
+    let half = run(["render", text(&out), "-o", "never.png"]);
+    assert_failed(
+        &half,
+        1,
+        &[
+            "export to this folder was begun",
+            "repeat the command",
+            text(&out),
+        ],
+    );
+}
+
+#[test]
+fn what_is_asked_for_outside_the_volume() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let picture = folder.path().join("picture.png");
+    let render = |more: &[&str]| {
+        run(["render", &archive, "-o", text(&picture)]
+            .iter()
+            .chain(more))
+    };
+    for (more, parts) in [
+        (&["--slice", "z=9999"][..], &["z=9999", "from 0 to 11"][..]),
+        (&["--clip", "150,0,0,160,9,9"], &["along x", "150", "160"]),
+        (
+            &["--slice", "z=3", "--clip", "0,0,5,9,9,9"],
+            &["along z", "from 5 to 9", "from 3 to 3"],
+        ),
+    ] {
+        assert_failed(&render(more), 1, parts);
+    }
+    for (transfer, part) in [
+        (
+            r#""window": [0.5, 0.5], "opacity": [], "opacity_length_nm": 9"#,
+            "window",
+        ),
+        (
+            r#""window": [0, 1], "opacity": [], "opacity_length_nm": 0"#,
+            "above 0",
+        ),
+        (
+            r#""window": [0, 1], "opacity": [{"value": 0.9, "opacity": 1}, {"value": 0.1, "opacity": 0}],
+               "opacity_length_nm": 9"#,
+            "order of their values",
+        ),
+    ] {
+        let json = format!(r#"{{"polarity": "dark", "color_map": "bone", {transfer}}}"#);
+        assert_failed(&render(&["--transfer", &json]), 1, &[part]);
+    }
+    assert_failed(&render(&["--iso", "2"]), 2, &["0 to 1"]);
+    assert!(!picture.exists());
+}
+
 #[test]
 fn bad_tiles_are_set_aside_and_told() {
     let folder = tempfile::tempdir().unwrap();

@@ -75,6 +75,54 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
+/// A database without tables is a catalog that is about to be made; one that the server does not have is not.
+#[test]
+fn an_empty_database_is_waited_for() {
+    let Some(server) = Server::start(&[]) else {
+        return;
+    };
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let url = runtime.block_on(server.database());
+    let folder = tempfile::tempdir().unwrap();
+    let acquisition = folder.path().join("acquisition");
+    let archive = folder.path().join("archive");
+    simulate(&acquisition, "150,130,12");
+
+    let nowhere = url.replace("/db", "/nodb");
+    for command in ["ingest", "serve"] {
+        let mut arguments = vec![command];
+        arguments.extend((command == "ingest").then_some(text(&acquisition)));
+        arguments.extend([text(&archive), "--catalog", &nowhere]);
+        let output = saccade().args(arguments).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        for part in ["no database of that name", "createdb", "/nodb"] {
+            assert!(said.contains(part), "{part:?} is not in: {said}");
+        }
+    }
+
+    let serve = ["serve", text(&archive), "--port", "0", "--catalog", &url];
+    let serve = Program::start(&serve);
+    says(
+        &serve.stderr,
+        "there is no catalog; `saccade ingest` makes one",
+    );
+    let place = [text(&acquisition), text(&archive), "--catalog", &url];
+    Program::start(&[&["ingest", "--once", "--lossless"], &place[..]].concat()).ends_well();
+    says(&serve.stderr, "the catalog can be used now");
+    let address = says(&serve.stdout, "http://127.0.0.1:");
+    saccade_archive::tls::provide();
+    let until = SystemTime::now() + PATIENCE;
+    while runtime
+        .block_on(saccade_source::remote::volumes(&address))
+        .unwrap()
+        .is_empty()
+    {
+        assert!(SystemTime::now() < until, "the volume is not offered");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
 #[test]
 fn it_is_waited_for_and_work_goes_on() {
     let Some(server) = Server::start(&[]) else {
@@ -128,6 +176,14 @@ fn it_is_waited_for_and_work_goes_on() {
     server.kill();
     let chunk = format!("/v/{name}/zarr/0/c/0/0/0/0");
     assert_eq!(status(&chunk), 503, "not an absent chunk, which is 404");
+    for path in [&chunk, &format!("/v/{name}/status.json")] {
+        let told = runtime.block_on(async {
+            let get = reqwest::get(format!("{}{path}", address.trim_end_matches('/')));
+            get.await.unwrap().text().await.unwrap()
+        });
+        assert!(told.contains("server does not answer; start it"), "{told}");
+        assert!(!told.contains("postgres://"), "{told}");
+    }
     says(&serve.stderr, "server does not answer");
     assert_eq!(status(&metadata), 200, "what is known stays");
     server.run();

@@ -19,6 +19,8 @@ use saccade_core::voxel_box::VoxelBox;
 pub(super) enum Fault {
     /// This status line and headers.
     Status(&'static str),
+    /// The same, with this body.
+    Refusal(&'static str, &'static str),
     /// The connection is closed without an answer.
     Reset,
     /// Half a body, then the connection is closed.
@@ -224,6 +226,7 @@ impl Server {
         match fault {
             None => answer(stream, "200 OK", &bytes).await,
             Some(Fault::Status(status)) => answer(stream, status, b"sorry").await,
+            Some(Fault::Refusal(status, body)) => answer(stream, status, body.as_bytes()).await,
             Some(Fault::Reset) => stream.shutdown().await,
             Some(Fault::Cut) => {
                 bytes.truncate(bytes.len() / 2);

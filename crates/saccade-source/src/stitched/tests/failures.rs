@@ -88,6 +88,7 @@ fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
                 Some(bytes) => fixture.storage.write_durable(&left, bytes).await.unwrap(),
             }
             let source = fixture.open().await;
+            assert_eq!(source.damage(), [], "nobody looked");
             let want = fixture.expected();
             for x in [0, 1] {
                 let error = source.read(id(x)).await.unwrap_err();
@@ -109,6 +110,13 @@ fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
                 }
             }
 
+            let damage = source.damage();
+            assert_eq!(damage.len(), 1, "{damage:?}");
+            assert_eq!((damage[0].section, &damage[0].object), (1, &left));
+            let mend = ["append the tile's record", "saccade check"];
+            let reason = &damage[0].reason;
+            assert!(mend.iter().any(|way| reason.contains(way)), "{reason}");
+
             let mut changes = source.changes();
             fixture
                 .put("left", tile((120, 64), 1, (0.0, 0.0), 0.0, 1.0, 7))
@@ -119,6 +127,7 @@ fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
                 source.read(id(0)).await.unwrap(),
                 Chunk::Voxels(want.into())
             );
+            assert_eq!(source.damage(), [], "it was healed");
         });
     }
 }
@@ -135,6 +144,7 @@ fn a_tile_that_could_not_be_read_is_tried_again() {
         };
         let source = fixture.open_with(options).await;
         assert!(source.read(id(0)).await.is_err());
+        assert_eq!(source.damage().len(), 1);
         fixture.storage.write_durable(&left, whole).await.unwrap();
         while source.read(id(0)).await.is_err() {
             tokio::time::sleep(Duration::from_millis(5)).await;
@@ -142,6 +152,7 @@ fn a_tile_that_could_not_be_read_is_tried_again() {
         let built = source.statistics().blocks_built;
         assert!(source.read(id(0)).await.is_ok());
         assert_eq!(source.statistics().blocks_built, built, "now it is kept");
+        assert_eq!(source.damage(), []);
     });
 }
 
