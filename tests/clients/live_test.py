@@ -17,7 +17,7 @@ import zarr
 
 from lib.clients import all_tensorstores, everyone
 from lib.reference import Reference
-from lib.saccade import BIN, Acquisition
+from lib.saccade import BIN, Acquisition, Labels
 
 POSITIONS = 60
 random = np.random.default_rng(5)
@@ -154,6 +154,27 @@ class Live(unittest.TestCase):
         again = subprocess.run(run, capture_output=True, text=True, timeout=60)
         self.assertNotEqual(again.returncode, 0)
         self.assertIn("there is something already", again.stderr)
+
+    def test_3_labels_are_said_to_be_labels_and_stay_labels(self):
+        with Labels() as labels:
+            for version, folder, zarr_format in [("0.5", "zarr", 3), ("0.4", "zarr2", 2)]:
+                group = zarr.open_group(f"{labels.url}/{folder}", mode="r", zarr_format=zarr_format)
+                image = ome_zarr_models.open_ome_zarr(group, version=version)
+                self.assertEqual((type(image).__name__, image.ome_zarr_version), ("ImageLabel", version))
+                image = yaozarrs.validate_ome_json(json.dumps(labels.ome(folder)))
+                self.assertEqual(type(image).__name__, "LabelImage")
+            yaozarrs.validate_zarr_store(f"{labels.url}/zarr")
+            info = json.loads(labels.get("precomputed/info"))
+            self.assertEqual((info["type"], info["data_type"]), ("segmentation", "uint16"))
+            for level, scale in enumerate(info["scales"]):
+                x, y, z = scale["size"]
+                at = np.stack(np.meshgrid(np.arange(x), np.arange(y), np.arange(z), indexing="ij"), -1).reshape(-1, 3)
+                read = {name: client(level, at) for name, client in everyone(labels.url).items()}
+                first, *others = read.values()
+                for other in others:
+                    np.testing.assert_array_equal(other, first)
+                self.assertLessEqual(set(np.unique(first)), {0, *Labels.NUMBERS}, f"level {level}")
+                self.assertGreater(len(np.unique(first)), 2, f"level {level}")
 
     @unittest.skipUnless(os.environ.get("SACCADE_CHROMIUM"), "no browser is named")
     def test_4_neuroglancer_shows_the_voxels(self):

@@ -10,6 +10,9 @@ import time
 import urllib.request
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 BIN = os.environ.get("SACCADE_BIN")
 if not BIN:
     raise SystemExit("SACCADE_BIN must name the saccade binary; ./dev test sets it")
@@ -123,4 +126,49 @@ class Acquisition:
     def close(self):
         for process in reversed(self.processes):
             process.stop()
+        self.folder.cleanup()
+
+
+class Labels:
+    """Tiles of labels of 16 bits that overlap and are turned, behind a server."""
+
+    NUMBERS = [7, 300, 41_000, 65_535]
+
+    def __init__(self):
+        self.folder = tempfile.TemporaryDirectory(prefix="saccade-labels-")
+        work = Path(self.folder.name)
+        scope, archive = work / "scope", work / "archive"
+        scope.mkdir()
+        volume = {"name": "cells", "extent": [240, 170, 3], "voxel_nm": [4, 4, 40], "dtype": "uint16", "kind": "labels"}
+        (scope / "volume.json").write_text(json.dumps(volume))
+        random = np.random.default_rng(3)
+        with (scope / "tiles.jsonl").open("w") as records:
+            for n, (x, y, turn) in enumerate([(-5, 3, 0.02), (95, -8, -0.03), (20.5, 60, 0.3)]):
+                cells = random.choice([0, *self.NUMBERS], (18, 20)).astype(np.uint16)
+                pixels = np.kron(cells, np.ones((9, 8), np.uint16))
+                Image.fromarray(pixels).save(scope / f"{n}.png")
+                cos, sin = np.cos(turn), np.sin(turn)
+                size = [pixels.shape[1], pixels.shape[0]]
+                record = {"record": "tile", "tile": str(n), "file": f"{n}.png", "section": n // 2, "size": size,
+                          "transform": [cos, sin, -sin, cos, x, y]}
+                records.write(json.dumps(record) + "\n")
+        subprocess.run([BIN, "ingest", scope, archive, "--once"], check=True, capture_output=True)
+        self.server = Process(work / "serve.log", "serve", archive, "--port", "0")
+        self.url = self.server.printed(r"http://[\w.:]+") + "/v/cells"
+
+    def get(self, path):
+        with urllib.request.urlopen(f"{self.url}/{path}", timeout=20) as answer:
+            return answer.read()
+
+    def ome(self, folder):
+        """The image's metadata, as its version has them."""
+        if folder == "zarr":
+            return json.loads(self.get("zarr/zarr.json"))["attributes"]["ome"]
+        return json.loads(self.get("zarr2/.zattrs"))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.server.stop()
         self.folder.cleanup()
