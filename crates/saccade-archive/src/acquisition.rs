@@ -77,8 +77,9 @@ pub enum AcquisitionError {
     },
     /// The records were cut or replaced, although they are only ever appended to.
     #[error(
-        "the records end at byte {len}, but were read up to byte {read} before; records are only \
-         ever appended: restore the file, or ingest into a new volume: {}",
+        "the records end at byte {len}, but were read up to byte {read} before, and are only ever appended; \
+         put the old ones back, or take these in under another name (`saccade ingest --volume NAME`) or into \
+         another archive: {}",
         path.display()
     )]
     RecordsCut {
@@ -86,6 +87,19 @@ pub enum AcquisitionError {
         len: u64,
         /// What was read earlier \[bytes\].
         read: u64,
+        /// File.
+        path: PathBuf,
+    },
+    /// Other records have taken the place of those that were read.
+    #[error(
+        "these are not the records of which {line} lines were taken in before: another acquisition has taken \
+         their place; take it in under another name (`saccade ingest --volume NAME`) or into another archive, \
+         or put the old records back: {}",
+        path.display()
+    )]
+    RecordsReplaced {
+        /// Lines that were read earlier.
+        line: u64,
         /// File.
         path: PathBuf,
     },

@@ -597,7 +597,7 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn cursor(&self, volume: &str) -> Result<Cursor, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let question = "SELECT byte, line FROM cursors WHERE volume = $1";
+        let question = "SELECT byte, line, seen FROM cursors WHERE volume = $1";
         let found = self.ask(question, &[id.into()], rows::cursor).await?;
         Ok(found.into_iter().next().unwrap_or_default())
     }

@@ -351,7 +351,8 @@ impl Check<'_> {
         reason: &str,
     ) -> Result<Repair, CheckError> {
         let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
-        let repair = match self.record(tile) {
+        let read = self.archive.catalog().cursor(&entry.volume.name).await?;
+        let repair = match self.record(tile, read) {
             Some((position, record)) => {
                 let reason = format!("its pyramid was found damaged: {reason}");
                 let waiting = Waiting {
@@ -381,11 +382,17 @@ impl Check<'_> {
         Ok(repair)
     }
 
-    /// The record that a tile's pyramid was made of, if it and its image are still there.
-    fn record(&self, tile: &Tile) -> Option<(u64, TileRecord)> {
+    /// The record that a tile's pyramid was made of, if it and its image are still there, and the records are
+    /// those that were `read`.
+    fn record(&self, tile: &Tile, read: Cursor) -> Option<(u64, TileRecord)> {
         let folder = self.options.acquisition.as_ref()?;
+        RecordReader::new(folder, read).recognize().ok()?;
         let offset = position_of(&tile.pyramid)?;
-        let mut reader = RecordReader::new(folder, Cursor { offset, line: 0 });
+        let cursor = Cursor {
+            offset,
+            ..Cursor::default()
+        };
+        let mut reader = RecordReader::new(folder, cursor);
         let line = reader.read(1).ok()?.into_iter().next()?;
         match line.record {
             Ok(Record::Tile(record)) if record.tile == tile.name && line.offset == offset => {

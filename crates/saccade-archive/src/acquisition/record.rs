@@ -13,6 +13,12 @@ use super::AcquisitionError;
 /// Bytes a line may have; a longer one is broken.
 const MAX_LINE: usize = 1 << 16;
 
+/// Bytes at the beginning by which records are known again.
+const HEAD: usize = 4096;
+
+/// Bytes before a cursor by which records are known again: about three tiles.
+const TAIL: usize = 512;
+
 /// One line of `tiles.jsonl`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "record", rename_all = "lowercase")]
@@ -82,13 +88,16 @@ pub struct TransformRecord {
     pub transform: SectionFromTile,
 }
 
-/// How far the records were read.
+/// How far the records were read, and which.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Cursor {
     /// Where the next line begins \[bytes\].
     pub offset: u64,
     /// Lines before it.
     pub line: u64,
+    /// Checksums of the first bytes and of the last ones before `offset`; `None` where nobody looked: at the
+    /// beginning, or in catalogs of earlier versions.
+    pub seen: Option<u64>,
 }
 
 /// A line that is no record.
@@ -136,13 +145,34 @@ impl RecordReader {
         self.cursor
     }
 
+    /// Looks whether what lies before the cursor is what was read; a cursor that does not know what that was
+    /// learns it. Returns the cursor.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::read`].
+    pub fn recognize(&mut self) -> Result<Cursor, AcquisitionError> {
+        let failed = |source| AcquisitionError::Read {
+            source,
+            path: self.path.clone(),
+        };
+        if let Some((_, prefix)) = self.open().map_err(failed)??
+            && self.cursor.offset > 0
+        {
+            self.cursor.seen = Some(prefix.seen());
+        }
+        Ok(self.cursor)
+    }
+
     /// The next whole lines, at most `max`; empty lines are skipped. None if there is no file yet.
     ///
     /// A last line without its line feed is still being written, and is left for later.
     ///
     /// # Errors
     ///
-    /// [`AcquisitionError::Read`], and [`AcquisitionError::RecordsCut`] for a file that got shorter.
+    /// [`AcquisitionError::Read`], [`AcquisitionError::RecordsCut`] for a file that got shorter, and
+    /// [`AcquisitionError::RecordsReplaced`] for one that begins otherwise, or holds other bytes before the
+    /// cursor, than what was read.
     pub fn read(&mut self, max: usize) -> Result<Vec<RecordLine>, AcquisitionError> {
         self.read_lines(max)
             .map_err(|source| AcquisitionError::Read {
@@ -167,30 +197,41 @@ impl RecordReader {
         }
     }
 
-    fn read_lines(&mut self, max: usize) -> io::Result<Result<Vec<RecordLine>, AcquisitionError>> {
+    /// The file at the cursor, and what lies before it; `None` if there is no file yet.
+    fn open(&self) -> io::Result<Result<Option<(File, Prefix)>, AcquisitionError>> {
+        let Cursor { offset, line, seen } = self.cursor;
         let mut file = match File::open(&self.path) {
             Ok(file) => file,
-            Err(e) if e.kind() == io::ErrorKind::NotFound && self.cursor.offset == 0 => {
-                return Ok(Ok(Vec::new()));
-            }
+            Err(e) if e.kind() == io::ErrorKind::NotFound && offset == 0 => return Ok(Ok(None)),
             Err(e) => return Err(e),
         };
         let len = file.metadata()?.len();
-        if len < self.cursor.offset {
-            let read = self.cursor.offset;
-            return Ok(Err(AcquisitionError::RecordsCut {
-                len,
-                read,
-                path: self.path.clone(),
-            }));
+        let path = || self.path.clone();
+        if len < offset {
+            let (read, path) = (offset, path());
+            return Ok(Err(AcquisitionError::RecordsCut { len, read, path }));
         }
-        file.seek(SeekFrom::Start(self.cursor.offset))?;
+        let prefix = Prefix::read(&mut file, offset)?;
+        if seen.is_some_and(|seen| seen != prefix.seen()) {
+            let path = path();
+            return Ok(Err(AcquisitionError::RecordsReplaced { line, path }));
+        }
+        file.seek(SeekFrom::Start(offset))?;
+        Ok(Ok(Some((file, prefix))))
+    }
+
+    fn read_lines(&mut self, max: usize) -> io::Result<Result<Vec<RecordLine>, AcquisitionError>> {
+        let (file, mut prefix) = match self.open()? {
+            Ok(Some(opened)) => opened,
+            Ok(None) => return Ok(Ok(Vec::new())),
+            Err(e) => return Ok(Err(e)),
+        };
         let mut file = BufReader::new(file);
         let mut lines = Vec::new();
         let mut text = Vec::new();
         while lines.len() < max {
             text.clear();
-            let read = read_line(&mut file, &mut text)?;
+            let read = read_line(&mut file, &mut text, &mut prefix)?;
             if !read.ended {
                 break;
             }
@@ -198,6 +239,7 @@ impl RecordReader {
             self.cursor = Cursor {
                 offset: offset + read.bytes,
                 line: self.cursor.line + 1,
+                seen: Some(prefix.seen()),
             };
             if text.iter().all(u8::is_ascii_whitespace) {
                 continue;
@@ -219,13 +261,54 @@ impl RecordReader {
     }
 }
 
+/// What lies before a place in the records, as far as it takes to know it again. Other acquisitions of the same
+/// volume differ from their first tiles on, or else where they were read up to.
+#[derive(Clone, Debug, Default)]
+struct Prefix {
+    bytes: u64,
+    head: crc32fast::Hasher,
+    tail: Vec<u8>,
+}
+
+impl Prefix {
+    /// Of a file's first `bytes`.
+    fn read(file: &mut File, bytes: u64) -> io::Result<Self> {
+        let mut prefix = Self::default();
+        let mut part = |from: u64, most: u64| {
+            file.seek(SeekFrom::Start(from))?;
+            let mut part = Vec::new();
+            Read::by_ref(file).take(most).read_to_end(&mut part)?;
+            Ok::<_, io::Error>(part)
+        };
+        let tail = bytes.min(TAIL as u64);
+        prefix.push(&part(0, bytes.min(HEAD as u64))?);
+        prefix.tail = part(bytes - tail, tail)?;
+        prefix.bytes = bytes;
+        Ok(prefix)
+    }
+
+    fn push(&mut self, part: &[u8]) {
+        let head = usize::try_from(self.bytes).map_or(0, |bytes| HEAD.saturating_sub(bytes));
+        self.head.update(&part[..head.min(part.len())]);
+        self.bytes += part.len() as u64;
+        self.tail
+            .extend_from_slice(&part[part.len().saturating_sub(TAIL)..]);
+        self.tail.drain(..self.tail.len().saturating_sub(TAIL));
+    }
+
+    fn seen(&self) -> u64 {
+        let head = self.head.clone().finalize();
+        (u64::from(head) << 32) | u64::from(crc32fast::hash(&self.tail))
+    }
+}
+
 struct Line {
     bytes: u64,
     ended: bool,
 }
 
 /// Reads up to and including a line feed, but keeps no more than the longest sensible line.
-fn read_line(file: &mut impl BufRead, text: &mut Vec<u8>) -> io::Result<Line> {
+fn read_line(file: &mut impl BufRead, text: &mut Vec<u8>, prefix: &mut Prefix) -> io::Result<Line> {
     let mut line = Line {
         bytes: 0,
         ended: false,
@@ -239,6 +322,7 @@ fn read_line(file: &mut impl BufRead, text: &mut Vec<u8>) -> io::Result<Line> {
             break;
         }
         line.bytes += part.len() as u64;
+        prefix.push(&part);
         line.ended = part.ends_with(b"\n");
         if text.len() < MAX_LINE {
             text.append(&mut part);
@@ -477,11 +561,83 @@ mod tests {
             Cursor {
                 offset: 9999,
                 line: 7,
+                seen: None,
             },
         );
         assert!(matches!(
             reader.read(1),
             Err(AcquisitionError::RecordsCut { read: 9999, .. })
         ));
+    }
+
+    /// Of `count` lines, all as long as each other; `other` says which tiles are another acquisition's.
+    fn lines(count: usize, other: impl Fn(usize) -> bool) -> String {
+        let line = |n| {
+            let name = if other(n) { 'b' } else { 'a' };
+            serde_json::to_string(&tile(&format!("{name}{n:05}"))).unwrap() + "\n"
+        };
+        (0..count).map(line).collect()
+    }
+
+    #[test]
+    fn other_records_in_the_same_place_are_known() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(RecordReader::FILE);
+        for read in [1, 2, 5, 40, 300] {
+            std::fs::write(&path, lines(read, |_| false)).unwrap();
+            let mut reader = RecordReader::new(folder.path(), Cursor::default());
+            assert_eq!(reader.read(usize::MAX).unwrap().len(), read);
+            let cursor = reader.cursor();
+            let mut later = RecordReader::new(folder.path(), cursor);
+            assert_eq!(later.recognize().unwrap(), cursor);
+            // As long, and longer; from the first line on, and only from the last one on.
+            for (count, from) in [
+                (read, 0),
+                (read, read - 1),
+                (read + 9, 0),
+                (read + 9, read - 1),
+            ] {
+                std::fs::write(&path, lines(count, |n| n >= from)).unwrap();
+                for refused in [
+                    later.read(1).map(drop),
+                    later.recognize().map(drop),
+                    reader.read(1).map(drop),
+                ] {
+                    let replaced = matches!(
+                        refused,
+                        Err(AcquisitionError::RecordsReplaced { line, .. }) if line == read as u64
+                    );
+                    assert!(
+                        replaced,
+                        "{read} read, {count} lines, others from {from}: {refused:?}"
+                    );
+                }
+                assert_eq!(later.cursor(), cursor, "nothing was read");
+            }
+            // The same, and more of them.
+            std::fs::write(&path, lines(read + 3, |_| false)).unwrap();
+            assert_eq!(later.read(9).unwrap().len(), 3);
+        }
+    }
+
+    #[test]
+    fn a_cursor_of_an_earlier_version_learns_what_was_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(RecordReader::FILE);
+        let nothing = RecordReader::new(folder.path(), Cursor::default()).recognize();
+        assert_eq!(nothing.unwrap(), Cursor::default(), "no file yet");
+        std::fs::write(&path, lines(60, |_| false)).unwrap();
+        let mut reader = RecordReader::new(folder.path(), Cursor::default());
+        assert_eq!(reader.recognize().unwrap(), Cursor::default());
+        let read = reader.read(50).unwrap();
+        let old = Cursor {
+            seen: None,
+            ..reader.cursor()
+        };
+        let learned = RecordReader::new(folder.path(), old).recognize().unwrap();
+        assert_eq!(learned, reader.cursor());
+        // It is of the place, not of who read how much at once.
+        let mut again = RecordReader::new(folder.path(), read[20].next);
+        assert_eq!(again.read(29).unwrap().last().unwrap().next, learned);
     }
 }

@@ -316,9 +316,15 @@ impl<'c> Commit<'c> {
     ///
     /// What the database says.
     pub async fn cursor(&mut self, cursor: Cursor) -> Result<(), CatalogError> {
-        let insert = "INSERT INTO cursors (volume, byte, line) VALUES ($1, $2, $3) \
-                      ON CONFLICT (volume) DO UPDATE SET byte = excluded.byte, line = excluded.line";
-        let values = [self.volume.into(), cursor.offset.into(), cursor.line.into()];
+        let insert = "INSERT INTO cursors (volume, byte, line, seen) VALUES ($1, $2, $3, $4) \
+                      ON CONFLICT (volume) DO UPDATE SET \
+                      byte = excluded.byte, line = excluded.line, seen = excluded.seen";
+        let values = [
+            self.volume.into(),
+            cursor.offset.into(),
+            cursor.line.into(),
+            Value::MaybeInteger(cursor.seen.map(u64::cast_signed)),
+        ];
         self.run(insert, &values).await?;
         Ok(())
     }
@@ -330,7 +336,7 @@ impl<'c> Commit<'c> {
     ///
     /// What the database says.
     pub async fn advance(&mut self, from: Cursor, to: Cursor) -> Result<bool, CatalogError> {
-        let question = "SELECT byte, line FROM cursors WHERE volume = $1";
+        let question = "SELECT byte, line, seen FROM cursors WHERE volume = $1";
         let row = self.one(question, &[self.volume.into()]).await?;
         let now = row.as_ref().map(rows::cursor).transpose();
         let now = now.map_err(|e| self.catalog.failed(e))?;

@@ -122,6 +122,7 @@ pub(super) fn cursor(row: &Row) -> Result<Cursor, Error> {
     Ok(Cursor {
         offset: unsigned(row, "byte")?,
         line: unsigned(row, "line")?,
+        seen: row.get::<Option<i64>>("seen")?.map(i64::cast_unsigned),
     })
 }
 

@@ -21,6 +21,7 @@ async fn a_catalog_of_the_first_schema_is_brought_up() {
              (3, 1, 'c', 4, 20, 10, 1, 0, 0, 1, 0, 0, 'tiles/c', 3, 2, 2);
          INSERT INTO changes VALUES (1, 1, 1, 2, 5, 6, 25, 16, 'tile'),
              (1, 2, 2, 2, 0, 0, 20, 10, 'tile'), (1, 3, 3, 4, 0, 0, 20, 10, 'transform');
+         INSERT INTO cursors VALUES (1, 500, 3);
          CREATE TABLE _sqlx_migrations (version BIGINT PRIMARY KEY, description TEXT NOT NULL,
              installed_on TIMESTAMP NOT NULL DEFAULT CURRENT_TIMESTAMP, success BOOLEAN NOT NULL,
              checksum BLOB NOT NULL, execution_time BIGINT NOT NULL);
@@ -31,6 +32,8 @@ async fn a_catalog_of_the_first_schema_is_brought_up() {
     )).await;
     let catalog = Catalog::open(&path).await.unwrap();
     assert_eq!(catalog.sections("v").await.unwrap(), [2, 4]);
+    let cursor = catalog.cursor("v").await.unwrap();
+    assert_eq!((cursor.offset, cursor.line, cursor.seen), (500, 3, None));
     let tiles = catalog.section_tiles("v", 2).await.unwrap();
     let names: Vec<_> = tiles.iter().map(|t| (&*t.name, t.channel)).collect();
     assert_eq!(names, [("a", 0), ("b", 0)]);

@@ -334,6 +334,8 @@ pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
     let cursor = Cursor {
         offset: 700,
         line: 9,
+        // The highest bit as well.
+        seen: Some(u64::MAX - 5),
     };
     let fill = async || {
         let mut commit = catalog.begin("v").await.unwrap();

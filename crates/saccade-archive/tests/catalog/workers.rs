@@ -223,6 +223,7 @@ pub(crate) async fn records_are_read_once(place: &Place) {
     let cursor = |line| Cursor {
         offset: line * 100,
         line,
+        seen: (line > 0).then_some(line),
     };
     let advance = async |from, to| {
         let mut commit = catalog.begin("v").await.unwrap();
@@ -233,6 +234,16 @@ pub(crate) async fn records_are_read_once(place: &Place) {
     assert!(advance(0, 4).await);
     assert!(!advance(0, 4).await, "somebody else read these");
     assert_eq!(catalog.cursor("v").await.unwrap(), cursor(4));
+    let mut commit = catalog.begin("v").await.unwrap();
+    let other = Cursor {
+        seen: Some(5),
+        ..cursor(4)
+    };
+    assert!(
+        !commit.advance(other, cursor(7)).await.unwrap(),
+        "other records"
+    );
+    drop(commit);
     assert!(advance(4, 7).await);
     assert_eq!(catalog.cursor("v").await.unwrap(), cursor(7));
 }

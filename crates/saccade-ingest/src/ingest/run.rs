@@ -87,6 +87,19 @@ pub async fn run(
     }
     let catalog = archive.catalog();
     retry(options, progress, || catalog.create_volume(&volume)).await?;
+    // Before anything is worked on: what is in the queue may be of another acquisition.
+    let cursor = retry(options, progress, || catalog.cursor(&volume.name)).await?;
+    let mut reader = RecordReader::new(acquisition, cursor);
+    let known = patiently(options, progress, || reader.recognize()).await?;
+    if known != cursor {
+        let learn = async || {
+            let mut commit = catalog.begin(&volume.name).await?;
+            // If another has read on, it has learned it as well.
+            commit.advance(cursor, known).await?;
+            commit.finish().await
+        };
+        retry(options, progress, learn).await?;
+    }
     let (stored, why) = Stored::new(volume.dtype, volume.kind, options.encoding);
     if let Some(why) = why {
         progress.notice(why);
@@ -94,7 +107,6 @@ pub async fn run(
     let (name, process) = (worker_name(), process::this().unwrap_or_default());
     let register = || catalog.register_process(&name, &process, options.lease);
     let worker = retry(options, progress, register).await?;
-    let cursor = retry(options, progress, || catalog.cursor(&volume.name)).await?;
     let mut ingest = Ingest {
         archive,
         options,
@@ -109,7 +121,7 @@ pub async fn run(
             progress,
         },
         worker: &worker,
-        reader: RecordReader::new(acquisition, cursor),
+        reader,
         room: WaitingRoom::new(options.patience, options.poll, Vec::new()),
         meter: Meter::new(),
         summary: Summary::default(),
@@ -394,6 +406,8 @@ impl Supply<'_> {
         let (options, progress) = (self.options, self.context.progress);
         let (catalog, volume) = (self.archive.catalog(), self.context.volume);
         let batch = options.batch.max(1);
+        // Also where nothing new is read: what is in the queue is not to be found in others' images.
+        patiently(options, progress, || self.reader.recognize()).await?;
         let (queued, _) = retry(options, progress, || catalog.queued(volume)).await?;
         if queued >= batch as u64 {
             return Ok(false);
@@ -403,7 +417,7 @@ impl Supply<'_> {
         if self.reader.cursor() != from {
             *self.reader = RecordReader::new(self.context.folder, from);
         }
-        let lines = self.read(batch).await?;
+        let lines = patiently(options, progress, || self.reader.read(batch)).await?;
         self.blocked = false;
         if lines.is_empty() {
             self.left.store(queued, Ordering::Relaxed);
@@ -450,22 +464,26 @@ impl Supply<'_> {
         self.left.store(left, Ordering::Relaxed);
         Ok(taken > 0)
     }
+}
 
-    /// The next records. A share that fails for a moment does not end the stream.
-    async fn read(&mut self, max: usize) -> Result<Vec<RecordLine>, IngestError> {
-        let mut backoff = Backoff::new(self.options.retry);
-        loop {
-            match self.reader.read(max) {
-                Ok(lines) => return Ok(lines),
-                Err(e) => {
-                    // Who waits for the end is told, rather than kept.
-                    let patient = !self.options.once || backoff.failures < ATTEMPTS_ONCE;
-                    let passing = patient && matches!(e, AcquisitionError::Read { .. });
-                    if !backoff.may_go_on(false, passing) {
-                        return Err(e.into());
-                    }
-                    backoff.say_and_wait(self.context.progress, &e).await;
+/// Asks the records. A share that fails for a moment does not end the stream.
+async fn patiently<T>(
+    options: &IngestOptions,
+    progress: &dyn Progress,
+    mut ask: impl FnMut() -> Result<T, AcquisitionError>,
+) -> Result<T, IngestError> {
+    let mut backoff = Backoff::new(options.retry);
+    loop {
+        match ask() {
+            Ok(answer) => return Ok(answer),
+            Err(e) => {
+                // Who waits for the end is told, rather than kept.
+                let patient = !options.once || backoff.failures < ATTEMPTS_ONCE;
+                let passing = patient && matches!(e, AcquisitionError::Read { .. });
+                if !backoff.may_go_on(false, passing) {
+                    return Err(e.into());
                 }
+                backoff.say_and_wait(progress, &e).await;
             }
         }
     }

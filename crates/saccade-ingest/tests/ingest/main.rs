@@ -11,6 +11,7 @@ mod mended;
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;
 mod quarantine;
+mod replaced;
 mod scope;
 mod stream;
 mod workers;

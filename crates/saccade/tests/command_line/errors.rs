@@ -4,7 +4,7 @@ use std::net::TcpListener;
 use std::path::Path;
 use std::process::Output;
 
-use super::{Running, archive, run, saccade, simulate, stderr};
+use super::{Running, archive, done, run, saccade, simulate, stderr};
 
 /// Failed, in one report that holds all of `parts`.
 fn assert_failed(output: &Output, code: i32, parts: &[&str]) {
@@ -111,6 +111,31 @@ fn a_volume_of_another_size() {
             text(&other),
         ],
     );
+}
+
+/// Of the same name and size, but not the one that was taken in.
+#[test]
+fn a_second_acquisition_in_the_same_archive() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let other = folder.path().join("other");
+    simulate(&other, "150,130,12");
+    let records = other.join("tiles.jsonl");
+    let text_of = std::fs::read_to_string(&records).unwrap();
+    let line = text_of.lines().last().unwrap();
+    std::fs::write(
+        &records,
+        text_of.replace("\"tile\":\"", "\"tile\":\"other-") + line + "\n",
+    )
+    .unwrap();
+    let ingest = ["ingest", text(&other), &archive, "--once"];
+    let output = run(ingest);
+    assert_failed(
+        &output,
+        1,
+        &["another acquisition", "--volume NAME", text(&records)],
+    );
+    done(ingest.iter().chain(&["--volume", "second"]));
 }
 
 /// What is there goes on only with the options that made it.

@@ -1,0 +1,179 @@
+//! Another acquisition in the place of the one that was read: refused before anything of it is mixed in, or of the
+//! first one lost.
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use glam::UVec2;
+use saccade_archive::VisualizationArchive;
+use saccade_archive::acquisition::{AcquisitionError, Cursor, Record, RecordReader};
+use saccade_archive::catalog::Waiting;
+use saccade_ingest::Cancel;
+use saccade_ingest::ingest::{IngestError, IngestOptions, run};
+
+use crate::scope::{Diary, Scope, VOLUME, archive, quick, seen, tile_record};
+
+const SIZE: UVec2 = UVec2::new(140, 130);
+
+/// An acquisition of so many tiles; those of another microscope have other names, as long.
+fn acquired(prefix: &str, tiles: u32) -> Scope {
+    let scope = Scope::new();
+    for n in 0..tiles {
+        scope.tile(&format!("{prefix}{n}"), n, SIZE, 7 + n as u8);
+    }
+    scope
+}
+
+async fn refused(scope: &Path, archive: &VisualizationArchive) -> AcquisitionError {
+    match run(scope, archive, &quick(), &(), &Cancel::new()).await {
+        Err(IngestError::Acquisition(error)) => error,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn a_second_acquisition_is_refused_and_welcome_under_another_name() {
+    for first in [1, 3] {
+        let folder = tempfile::tempdir().unwrap();
+        let archive = archive(folder.path()).await;
+        acquired("a", first).ingest(&archive).await;
+        let before = (
+            seen(&archive).await,
+            archive.catalog().statistics(VOLUME).await.unwrap(),
+        );
+        for second in [first, first + 4] {
+            let scope = acquired("b", second);
+            let error = refused(scope.path(), &archive).await;
+            let told = error.to_string();
+            for part in [
+                "--volume NAME",
+                "another archive",
+                "tiles.jsonl",
+                &format!("{first} lines"),
+            ] {
+                assert!(told.contains(part), "{part:?} is not in: {told}");
+            }
+            assert!(
+                matches!(error, AcquisitionError::RecordsReplaced { .. }),
+                "{error:?}"
+            );
+            let after = (
+                seen(&archive).await,
+                archive.catalog().statistics(VOLUME).await.unwrap(),
+            );
+            assert!(after == before, "nothing happened");
+            let options = IngestOptions {
+                volume: Some(format!("of{second}")),
+                ..quick()
+            };
+            let done = run(scope.path(), &archive, &options, &(), &Cancel::new())
+                .await
+                .unwrap();
+            assert_eq!(done.tiles, u64::from(second));
+        }
+        let shorter = Scope::new();
+        assert!(matches!(
+            refused_or_cut(&shorter, &archive).await,
+            AcquisitionError::RecordsCut { len: 1, .. }
+        ));
+    }
+}
+
+/// With records of one byte.
+async fn refused_or_cut(scope: &Scope, archive: &VisualizationArchive) -> AcquisitionError {
+    fs::write(scope.path().join(RecordReader::FILE), "\n").unwrap();
+    refused(scope.path(), archive).await
+}
+
+/// What an ended ingest has left in the queue has names that another acquisition's images may have as well.
+#[tokio::test]
+async fn what_is_queued_is_not_looked_for_in_others_images() {
+    let (scope, folder) = (acquired("a", 2), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    scope.ingest(&archive).await;
+    // The next record was read, and then it ended.
+    let Record::Tile(record) = tile_record("b2", 2, SIZE) else {
+        panic!("a tile")
+    };
+    scope.say(&Record::Tile(record.clone()));
+    let catalog = archive.catalog();
+    let read = catalog.cursor(VOLUME).await.unwrap();
+    let mut reader = RecordReader::new(scope.path(), read);
+    reader.read(9).unwrap();
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    let reason = String::new();
+    let position = read.offset;
+    commit
+        .enqueue(&Waiting {
+            position,
+            record,
+            reason,
+        })
+        .await
+        .unwrap();
+    assert!(commit.advance(read, reader.cursor()).await.unwrap());
+    commit.finish().await.unwrap();
+
+    refused(acquired("b", 7).path(), &archive).await;
+    assert_eq!(catalog.tile(VOLUME, "b2").await.unwrap(), None);
+    // The queue is as it was.
+    scope.image("b2", SIZE, 1);
+    assert_eq!(scope.ingest(&archive).await.tiles, 1);
+}
+
+#[tokio::test]
+async fn records_replaced_while_they_are_followed_end_it() {
+    for (count, in_place) in [(3, false), (9, false), (3, true), (9, true)] {
+        let (scope, folder) = (acquired("a", 3), tempfile::tempdir().unwrap());
+        let archive = archive(folder.path()).await;
+        let options = IngestOptions {
+            once: false,
+            ..quick()
+        };
+        let (diary, cancel) = (Diary::default(), Cancel::new());
+        let work = run(scope.path(), &archive, &options, &diary, &cancel);
+        let replace = async {
+            while diary.states().last().is_none_or(|s| s.tiles < 3) {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+            let other = acquired("b", count);
+            let records = scope.path().join(RecordReader::FILE);
+            let text = fs::read(other.path().join(RecordReader::FILE)).unwrap();
+            if in_place {
+                fs::write(&records, text).unwrap();
+            } else {
+                let part = records.with_extension("part");
+                fs::write(&part, text).unwrap();
+                fs::rename(part, records).unwrap();
+            }
+        };
+        let both = async { tokio::join!(work, replace) };
+        let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+        let ended = both.expect("it is noticed").0;
+        assert!(
+            matches!(
+                ended,
+                Err(IngestError::Acquisition(
+                    AcquisitionError::RecordsReplaced { line: 3, .. }
+                ))
+            ),
+            "{count} in place {in_place}: {ended:?}"
+        );
+        assert_eq!(seen(&archive).await.len(), 3);
+    }
+}
+
+#[tokio::test]
+async fn catalogs_of_earlier_versions_learn_what_was_read() {
+    let (scope, folder) = (acquired("a", 3), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    scope.ingest(&archive).await;
+    let read = archive.catalog().cursor(VOLUME).await.unwrap();
+    let mut commit = archive.catalog().begin(VOLUME).await.unwrap();
+    commit.cursor(Cursor { seen: None, ..read }).await.unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(scope.ingest(&archive).await.tiles, 0);
+    assert_eq!(archive.catalog().cursor(VOLUME).await.unwrap(), read);
+    refused(acquired("b", 7).path(), &archive).await;
+}
