@@ -29,6 +29,7 @@ use saccade_archive::image::read_size;
 use saccade_core::transform::SectionFromTile;
 
 use crate::Cancel;
+use crate::simulate::settings::{Settings, difference, volume_differences};
 use list::List;
 
 mod list;
@@ -38,7 +39,7 @@ mod scan;
 mod tests;
 
 pub use pattern::{Pattern, PatternError, Place};
-pub use scan::{Disk, Entry, Folders, Found, Next, Scanner, Stamp};
+pub use scan::{Counts, Disk, Entry, Folders, Found, Next, Scanner, Stamp};
 
 /// How a folder is watched.
 #[derive(Clone, Debug, PartialEq)]
@@ -89,11 +90,13 @@ pub enum WatchError {
     },
     /// It was watched before as something else.
     #[error(
-        "this folder was watched before as another volume, or by another link; use another archive, or \
-         the same folder, extent and voxel size: {}",
+        "a folder is watched under this name already, otherwise: {differences}; give the same options, or take \
+         this one in under another name (`saccade ingest --volume NAME`) or into another archive: {}",
         path.display()
     )]
     Other {
+        /// What differs, in words.
+        differences: String,
         /// What is kept.
         path: PathBuf,
     },
@@ -112,6 +115,9 @@ impl WatchError {
     }
 }
 
+/// Name of the file that keeps what names meant when the folder was first watched.
+const SETTINGS: &str = "watched.json";
+
 /// A folder that is being watched.
 pub struct Watch<F> {
     config: WatchConfig,
@@ -124,6 +130,15 @@ pub struct Watch<F> {
     untold: VecDeque<Record>,
     /// Files whose size could not be read yet.
     unread: VecDeque<Unread>,
+    /// Whether the folder was gone through once.
+    seen: bool,
+}
+
+/// Whether nothing was told yet, and nobody is about to: then a mistake in an option binds nobody.
+fn is_unused(kept: &Path) -> Result<bool, WatchError> {
+    let records = fs::metadata(kept.join(RecordReader::FILE));
+    let none = records.map_or(true, |meta| meta.len() == 0);
+    Ok(none && List::open(kept)?.is_some())
 }
 
 /// A file that is not written as far as its size.
@@ -158,20 +173,41 @@ impl<F: Folders> Watch<F> {
             path: folder.to_owned(),
         };
         let folder = folder.canonicalize().map_err(look)?;
-        let other = || WatchError::Other {
-            path: kept.to_owned(),
-        };
         let link = kept.join(LINK);
-        match AcquisitionInfo::read(kept) {
-            Ok(info) if info == config.info => {}
-            Ok(_) => return Err(other()),
-            Err(_) => config.info.write(kept)?,
+        let info = AcquisitionInfo::read(kept).ok();
+        let linked = fs::read_link(&link).ok();
+        let pitch = config.pitch.to_array();
+        let pattern = config.pattern.to_string();
+        let now = Settings::of_watch(&pattern, pitch, config.scale, config.first);
+        let settings = Settings::read_from(kept.join(SETTINGS))?;
+        let mut differences = Vec::new();
+        if let Some(info) = &info {
+            differences.extend(volume_differences(info, &config.info));
         }
-        match fs::read_link(&link) {
-            Ok(to) if to == folder => {}
-            Ok(_) => return Err(other()),
-            Err(_) => std::os::unix::fs::symlink(&folder, &link)
-                .map_err(|source| WatchError::Write { source, path: link })?,
+        if let Some(there) = linked.as_ref().filter(|to| **to != folder) {
+            let (there, now) = (there.to_string_lossy(), folder.to_string_lossy());
+            differences.push(difference("folder", &there, &now));
+        }
+        if let Some(there) = &settings {
+            differences.extend(now.differences(there));
+        }
+        if !differences.is_empty() && !is_unused(kept)? {
+            return Err(WatchError::Other {
+                differences: differences.join("; "),
+                path: kept.to_owned(),
+            });
+        }
+        if info.as_ref() != Some(&config.info) {
+            config.info.write(kept)?;
+        }
+        if linked.as_ref() != Some(&folder) {
+            let old = if linked.is_some() { fs::remove_file(&link) } else { Ok(()) };
+            old.and_then(|()| std::os::unix::fs::symlink(&folder, &link))
+                .map_err(|source| WatchError::Write { source, path: link })?;
+        }
+        // Those of earlier versions did not keep them.
+        if settings.as_ref() != Some(&now) {
+            now.write_to(kept.join(SETTINGS))?;
         }
         let scanner = Scanner::new(folders, &folder, config.pattern.clone());
         let mut watch = Self {
@@ -182,6 +218,7 @@ impl<F: Folders> Watch<F> {
             list: None,
             untold: VecDeque::new(),
             unread: VecDeque::new(),
+            seen: false,
         };
         watch.take_over()?;
         Ok(watch)
@@ -217,6 +254,21 @@ impl<F: Folders> Watch<F> {
         }
         self.list = Some(list);
         Ok(true)
+    }
+
+    /// Why nothing is taken in: once the folder was gone through, and something is there, but no file whose name
+    /// fits the pattern.
+    pub fn unmatched(&self) -> Option<String> {
+        let counts = self.scanner.counts();
+        let (path, folder) = counts.other.as_ref().filter(|_| self.seen && counts.fit == 0)?;
+        let pattern = &self.config.pattern;
+        let why = pattern.mismatch(path, *folder).unwrap_or_default();
+        let Counts { files, folders, .. } = counts;
+        Some(format!(
+            "no file fits the pattern {pattern}; looked at were {files} files and {folders} folders below {}, \
+             such as {path:?}: {why}",
+            self.folder.display()
+        ))
     }
 
     /// Where the records are kept: what [`crate::ingest::run`] follows.
@@ -255,6 +307,7 @@ impl<F: Folders> Watch<F> {
             source,
             path: self.folder.clone(),
         })?;
+        self.seen |= next != Next::More;
         let now = self.scanner.now();
         if !self.unread.is_empty() {
             let again: HashSet<&str> = found.iter().map(|found| &*found.file).collect();
@@ -336,11 +389,17 @@ pub fn run<F: Folders>(
 ) -> Result<u64, WatchError> {
     let mut told = 0;
     let mut failures = 0;
+    let mut warned = false;
     while !cancel.is_cancelled() {
         match watch.look() {
             Ok((new, next)) => {
                 failures = 0;
                 told += new;
+                // Who looks once is told by the caller.
+                if let Some(why) = watch.unmatched().filter(|_| !once && !warned) {
+                    log::warn!("{why}; files that fit are waited for");
+                    warned = true;
+                }
                 match next {
                     Next::More => continue,
                     Next::Rest if once => break,

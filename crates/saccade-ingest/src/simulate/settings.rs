@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
 use serde_json::{Map, Value, json};
@@ -38,6 +38,11 @@ impl Settings {
         Self::new(json!({ "input": input }))
     }
 
+    /// Of a watched folder, by the names of its options.
+    pub(crate) fn of_watch(pattern: &str, pitch: [f64; 2], pixel: f64, first: u32) -> Self {
+        Self::new(json!({ "pattern": pattern, "pitch": pitch, "pixel": pixel, "first": first }))
+    }
+
     /// As it will be read again: text may lose a number's last bit.
     fn new(settings: Value) -> Self {
         let text = settings.to_string();
@@ -46,7 +51,11 @@ impl Settings {
 
     /// Those of an archive; `None` if it has none, or none that can be understood.
     pub(crate) fn read(folder: &Path) -> Result<Option<Self>, AcquisitionError> {
-        let path = folder.join(Self::FILE);
+        Self::read_from(folder.join(Self::FILE))
+    }
+
+    /// Those of a file; `None` if there is none, or none that can be understood.
+    pub(crate) fn read_from(path: PathBuf) -> Result<Option<Self>, AcquisitionError> {
         match fs::read(&path) {
             Ok(text) => Ok(serde_json::from_slice(&text).ok().map(Self)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
@@ -57,10 +66,17 @@ impl Settings {
     /// Writes them into an archive, whole or not at all. The folder is made if missing.
     pub(crate) fn write(&self, folder: &Path) -> Result<(), AcquisitionError> {
         let path = folder.join(Self::FILE);
+        match fs::create_dir_all(folder) {
+            Ok(()) => self.write_to(path),
+            Err(source) => Err(AcquisitionError::Write { source, path }),
+        }
+    }
+
+    /// Writes them into a file, whole or not at all.
+    pub(crate) fn write_to(&self, path: PathBuf) -> Result<(), AcquisitionError> {
         let part = part_of(&path);
         let text = serde_json::to_vec_pretty(&self.0).expect("JSON becomes text");
-        fs::create_dir_all(folder)
-            .and_then(|()| fs::write(&part, text))
+        fs::write(&part, text)
             .and_then(|()| fs::rename(&part, &path))
             .map_err(|source| AcquisitionError::Write { source, path })
     }
@@ -90,10 +106,25 @@ pub(crate) fn volume_differences(there: &AcquisitionInfo, now: &AcquisitionInfo)
         let words = |info: &AcquisitionInfo| by(&info.voxel_nm.to_array());
         differences.push(difference("voxel-nm", &words(there), &words(now)));
     }
+    if there.dtype != now.dtype {
+        let bits = |info: &AcquisitionInfo| format!("{} bits", 8 * info.dtype.bytes());
+        differences.push(difference("voxel", &bits(there), &bits(now)));
+    }
+    if there.kind != now.kind {
+        let words = |info: &AcquisitionInfo| format!("{:?}", info.kind).to_lowercase();
+        differences.push(difference("kind", &words(there), &words(now)));
+    }
+    if there.channels != now.channels {
+        let words = |info: &AcquisitionInfo| match &info.channels[..] {
+            [] => "one without a name".to_owned(),
+            names => names.join(","),
+        };
+        differences.push(difference("channels", &words(there), &words(now)));
+    }
     differences
 }
 
-fn difference(name: &str, there: &str, now: &str) -> String {
+pub(crate) fn difference(name: &str, there: &str, now: &str) -> String {
     format!("{name} is {there} there, {now} now")
 }
 

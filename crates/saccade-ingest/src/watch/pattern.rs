@@ -81,30 +81,82 @@ impl Pattern {
     pub fn folder(&self, depth: usize, name: &str, known: &Place) -> Option<Place> {
         let mut place = known.clone();
         let part = self.parts.get(depth).filter(|_| depth < self.depth())?;
-        fits(part, name, &mut place).then_some(place)
+        fit(part, name, &mut place).is_ok().then_some(place)
     }
 
     /// What a file's name says, with what its folders said.
     pub fn file(&self, name: &str, known: &Place) -> Option<Place> {
         let mut place = known.clone();
-        fits(self.parts.last()?, name, &mut place).then_some(place)
+        fit(self.parts.last()?, name, &mut place)
+            .is_ok()
+            .then_some(place)
+    }
+
+    /// Why a path below the watched folder fits no part of this; `None` if it fits.
+    pub fn mismatch(&self, path: &str, folder: bool) -> Option<String> {
+        let names: Vec<&str> = path.split('/').collect();
+        for (name, pieces) in names.iter().zip(&self.parts) {
+            let Err(stuck) = fit(pieces, name, &mut Place::default()) else {
+                continue;
+            };
+            let wanted = match stuck.wanted {
+                None => "nothing more".to_owned(),
+                Some(Piece::Text(text)) => format!("{text:?}"),
+                Some(Piece::Number(_)) => format!("a number for {}", shown(stuck.wanted)),
+                Some(_) => format!("a name for {}", shown(stuck.wanted)),
+            };
+            let (at, rest) = name.split_at(name.len() - stuck.rest.len());
+            let place = match (at, rest) {
+                ("", _) => format!("{name:?} begins otherwise"),
+                (_, "") => format!("{name:?} ends"),
+                _ => format!("after {at:?} comes {rest:?}"),
+            };
+            return Some(format!("{place} where {wanted} should be"));
+        }
+        let (deep, want) = (names.len() - 1, self.depth());
+        if folder {
+            (deep >= want).then(|| "it is a folder where the pattern has files".to_owned())
+        } else {
+            (deep != want).then(|| format!("it lies {deep} folders deep, the pattern's files {want}"))
+        }
     }
 }
 
-/// Whether a name fits; what it says goes to `place`. What was said before must be said again.
-fn fits(pieces: &[Piece], name: &str, place: &mut Place) -> bool {
+fn shown(piece: Option<&Piece>) -> &'static str {
+    match piece {
+        Some(Piece::Number(Field::Section)) => "{section}",
+        Some(Piece::Number(Field::Row)) => "{row}",
+        Some(Piece::Number(Field::Column)) => "{column}",
+        Some(Piece::Channel) => "{channel}",
+        Some(Piece::Anything) => "{}",
+        Some(Piece::Text(_)) | None => "",
+    }
+}
+
+/// How far a name fits.
+struct Stuck<'a> {
+    /// What is left of the name.
+    rest: &'a str,
+    /// What should come there; `None`: the end.
+    wanted: Option<&'a Piece>,
+}
+
+/// What a name says goes to `place`; if it does not fit, how far it does.
+fn fit<'a>(pieces: &'a [Piece], name: &'a str, place: &mut Place) -> Result<(), Stuck<'a>> {
+    let stuck = |wanted| Err(Stuck { rest: name, wanted });
     let Some((piece, after)) = pieces.split_first() else {
-        return name.is_empty();
+        return if name.is_empty() { Ok(()) } else { stuck(None) };
     };
     match piece {
-        Piece::Text(text) => name
-            .strip_prefix(text.as_str())
-            .is_some_and(|rest| fits(after, rest, place)),
+        Piece::Text(text) => match name.strip_prefix(text.as_str()) {
+            Some(rest) => fit(after, rest, place),
+            None => stuck(Some(piece)),
+        },
         Piece::Number(field) => {
             let digits = name.bytes().take_while(u8::is_ascii_digit).count();
             let (number, rest) = name.split_at(digits);
             let Ok(number) = number.parse() else {
-                return false;
+                return stuck(Some(piece));
             };
             let slot = match field {
                 Field::Section => &mut place.section,
@@ -112,7 +164,7 @@ fn fits(pieces: &[Piece], name: &str, place: &mut Place) -> bool {
                 Field::Column => &mut place.column,
             };
             *slot = number;
-            fits(after, rest, place)
+            fit(after, rest, place)
         }
         Piece::Channel | Piece::Anything => {
             // What follows is text or the end: two names beside each other are refused.
@@ -120,18 +172,32 @@ fn fits(pieces: &[Piece], name: &str, place: &mut Place) -> bool {
                 Some(Piece::Text(text)) => name.match_indices(text.as_str()).map(|m| m.0).collect(),
                 _ => vec![name.len()],
             };
-            ends.into_iter().any(|end| {
+            let mut farthest = Stuck {
+                rest: name,
+                wanted: if name.is_empty() || !ends.is_empty() {
+                    Some(piece)
+                } else {
+                    after.first()
+                },
+            };
+            for end in ends {
+                if end == 0 && *piece == Piece::Channel {
+                    continue;
+                }
                 let mut told = place.clone();
                 if *piece == Piece::Channel {
                     told.channel = Some(name[..end].to_owned());
                 }
-                let good =
-                    (end > 0 || *piece == Piece::Anything) && fits(after, &name[end..], &mut told);
-                if good {
-                    *place = told;
+                match fit(after, &name[end..], &mut told) {
+                    Ok(()) => {
+                        *place = told;
+                        return Ok(());
+                    }
+                    Err(stuck) if stuck.rest.len() < farthest.rest.len() => farthest = stuck,
+                    Err(_) => {}
                 }
-                good
-            })
+            }
+            Err(farthest)
         }
     }
 }
@@ -201,11 +267,7 @@ impl fmt::Display for Pattern {
             for piece in part {
                 match piece {
                     Piece::Text(text) => f.write_str(text)?,
-                    Piece::Number(Field::Section) => f.write_str("{section}")?,
-                    Piece::Number(Field::Row) => f.write_str("{row}")?,
-                    Piece::Number(Field::Column) => f.write_str("{column}")?,
-                    Piece::Channel => f.write_str("{channel}")?,
-                    Piece::Anything => f.write_str("{}")?,
+                    field => f.write_str(shown(Some(field)))?,
                 }
             }
         }

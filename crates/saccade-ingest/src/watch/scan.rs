@@ -115,6 +115,20 @@ pub enum Next {
     Rest,
 }
 
+/// What a scanner has met.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Files, of whatever name, when their folders were first listed.
+    pub files: u64,
+    /// Folders, of whatever name.
+    pub folders: u64,
+    /// Files whose path fits the pattern.
+    pub fit: u64,
+    /// One that does not fit, below the watched folder, and whether it is a folder: rather a file as deep as the
+    /// pattern, and rather none that is hidden.
+    pub other: Option<(String, bool)>,
+}
+
 /// A folder's time counts only once it is this old: file systems stamp coarsely, and a file may have been
 /// added in the same tick after the folder was listed.
 const SETTLED: Duration = Duration::from_secs(3);
@@ -126,6 +140,8 @@ struct Known {
     place: Place,
     /// Its time when it was last listed whole; `None` if it must be listed again.
     listed: Option<SystemTime>,
+    /// Whether what is in it was counted.
+    counted: bool,
 }
 
 struct Listing {
@@ -157,6 +173,9 @@ pub struct Scanner<F> {
     /// When the last of them was told of.
     told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
+    counts: Counts,
+    /// How well what [`Counts::other`] names shows what is wrong.
+    telling: u32,
 }
 
 impl<F: Folders> Scanner<F> {
@@ -167,6 +186,7 @@ impl<F: Folders> Scanner<F> {
             depth: 0,
             place: Place::default(),
             listed: None,
+            counted: false,
         };
         Self {
             folders,
@@ -182,6 +202,8 @@ impl<F: Folders> Scanner<F> {
             told: HashSet::new(),
             told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
+            counts: Counts::default(),
+            telling: 0,
         }
     }
 
@@ -193,6 +215,28 @@ impl<F: Folders> Scanner<F> {
     /// What a file looks like; `None` if it cannot be asked.
     pub(super) fn stamp(&self, file: &str) -> Option<Stamp> {
         self.folders.stamp(&self.root.join(file)).ok()
+    }
+
+    /// What was met so far.
+    pub fn counts(&self) -> &Counts {
+        &self.counts
+    }
+
+    /// Notes one that does not fit.
+    fn misfit(&mut self, path: &Path, folder: bool, as_deep: bool) {
+        let hidden = path
+            .file_name()
+            .is_none_or(|name| name.as_encoded_bytes().starts_with(b"."));
+        let telling = match (hidden, folder, as_deep) {
+            (true, ..) => 1,
+            (_, true, _) => 2,
+            (_, false, false) => 3,
+            (_, false, true) => 4,
+        };
+        if telling > self.telling {
+            self.telling = telling;
+            self.counts.other = Some((path.to_string_lossy().into_owned(), folder));
+        }
     }
 
     /// Says that a file was told of by an earlier process, no later than [`Self::told_until`] says.
@@ -272,19 +316,30 @@ impl<F: Folders> Scanner<F> {
             Some(Ok(entry)) => entry,
             end => {
                 // One that broke off is listed again.
-                self.known[folder].listed = listing.modified.filter(|_| end.is_none());
+                let known = &mut self.known[folder];
+                known.listed = listing.modified.filter(|_| end.is_none());
+                known.counted |= end.is_none();
                 self.listing = None;
                 return;
             }
         };
         let Known {
-            path, depth, place, ..
+            path,
+            depth,
+            place,
+            counted,
+            ..
         } = &self.known[folder];
         let below = path.join(&entry.name);
+        let as_deep = *depth == self.pattern.depth();
+        let count = u64::from(!counted);
         if entry.folder {
-            if let Some(place) = self.pattern.folder(*depth, &entry.name, place)
-                && !self.paths.contains_key(&below)
-            {
+            self.counts.folders += count;
+            let Some(place) = self.pattern.folder(*depth, &entry.name, place) else {
+                self.misfit(&below, true, as_deep);
+                return;
+            };
+            if !self.paths.contains_key(&below) {
                 let depth = depth + 1;
                 let index = self.known.len();
                 self.paths.insert(below.clone(), index);
@@ -293,17 +348,19 @@ impl<F: Folders> Scanner<F> {
                     depth,
                     place,
                     listed: None,
+                    counted: false,
                 });
                 self.round.push_front(index);
             }
             return;
         }
-        if *depth != self.pattern.depth() {
-            return;
-        }
-        let Some(place) = self.pattern.file(&entry.name, place) else {
+        self.counts.files += count;
+        let place = self.pattern.file(&entry.name, place).filter(|_| as_deep);
+        let Some(place) = place else {
+            self.misfit(&below, false, as_deep);
             return;
         };
+        self.counts.fit += 1;
         *left = left.saturating_sub(1);
         let Ok(stamp) = self.folders.stamp(&self.root.join(&below)) else {
             // Gone, or not to be seen: the folder is looked through again.

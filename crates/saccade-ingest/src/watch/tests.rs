@@ -420,15 +420,128 @@ fn records_are_written_once_also_by_another_process() {
     sorted.sort();
     assert_eq!(sorted, want);
 
-    // Another volume, or another folder, is not mixed in.
-    let mut other = config();
-    other.info.extent.x = 1;
-    let refused = Watch::open(other, Disk, &scope, &kept).err().unwrap();
-    assert!(matches!(refused, WatchError::Other { .. }), "{refused}");
+    // Another folder is not mixed in.
     let refused = Watch::open(config(), Disk, folder.path(), &kept)
         .err()
         .unwrap();
-    assert!(matches!(refused, WatchError::Other { .. }), "{refused}");
+    assert!(refused.to_string().contains("folder is "), "{refused}");
+}
+
+/// A change of an option, and what is said of it.
+type Otherwise = (fn(&mut WatchConfig), &'static str);
+
+#[test]
+fn a_folder_is_watched_on_with_the_same_options_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    image(&scope.join("s3/r2_c1_b.tif"), 40, 9);
+    looks(&mut Watch::open(config(), Disk, &scope, &kept).unwrap());
+    let others: [Otherwise; 8] = [
+        (|c| c.pitch.y = 81.0, "pitch is 90.0 x 80.0 there, 90.0 x 81.0 now"),
+        (|c| c.scale = 1.0, "pixel is 2.0 there, 1.0 now"),
+        (|c| c.first = 0, "first is 1 there, 0 now"),
+        (
+            |c| c.pattern = "s{section}/r{column}_c{row}_{channel}.tif".parse().unwrap(),
+            "pattern is s{section}/r{row}_c{column}_{channel}.tif there, \
+             s{section}/r{column}_c{row}_{channel}.tif now",
+        ),
+        (|c| c.info.extent.x = 1, "extent is 500 x 500 x 9 there, 1 x 500 x 9 now"),
+        (|c| c.info.voxel_nm.z = 2.0, "voxel-nm is 1 x 1 x 1 there, 1 x 1 x 2 now"),
+        (|c| c.info.channels.reverse(), "channels is a,b there, b,a now"),
+        (
+            |c| c.info.dtype = saccade_core::volume::Dtype::Uint16,
+            "voxel is 8 bits there, 16 bits now",
+        ),
+    ];
+    for known in [true, false] {
+        for (change, said) in others {
+            let mut other = config();
+            change(&mut other);
+            let opened = Watch::open(other, Disk, &scope, &kept).map(|_| ());
+            let told = opened.map_err(|e| e.to_string()).err().unwrap();
+            let end = "; give the same options";
+            assert!(told.contains(&format!(": {said}{end}")), "{told}");
+            assert!(told.contains("--volume NAME"), "{told}");
+        }
+        // What looks and rates are like may change.
+        let mut same = config();
+        (same.budget, same.poll) = (99, Duration::ZERO);
+        if known {
+            // As an earlier version left it: it is asked once more.
+            fs::remove_file(kept.join(SETTINGS)).unwrap();
+        }
+        looks(&mut Watch::open(same, Disk, &scope, &kept).unwrap());
+        assert_eq!(told(&kept).len(), 1);
+    }
+}
+
+#[test]
+fn a_mistake_that_took_nothing_in_binds_nobody() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    let other = folder.path().join("other");
+    fs::create_dir_all(&other).unwrap();
+    image(&scope.join("s3/r2_c1_b.tif"), 40, 9);
+    let mut wrong = config();
+    wrong.pattern = "x{section}.tif".parse().unwrap();
+    wrong.info.extent.x = 7;
+    let watch = Watch::open(wrong, Disk, &other, &kept).unwrap();
+    let busy = Watch::open(config(), Disk, &scope, &kept).map(drop);
+    assert!(matches!(busy, Err(WatchError::Other { .. })), "it is at it");
+    drop(watch);
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    assert_eq!(told(&kept).len(), 1);
+    assert_eq!(AcquisitionInfo::read(&kept).unwrap(), config().info);
+    let file = told(&kept)[0].file.clone();
+    assert!(kept.join(file).is_file(), "the link leads to the right folder");
+}
+
+#[test]
+fn a_pattern_that_fits_nothing_is_explained() {
+    let deep = pattern("s{section}/r{row}_c{column}_{channel}.tif");
+    let why = |path: &str| deep.mismatch(path, false).unwrap();
+    for (path, said) in [
+        ("x1/r2_c3_a.tif", r#""x1" begins otherwise where "s" should be"#),
+        ("sx/r2_c3_a.tif", r#"after "s" comes "x" where a number for {section} should be"#),
+        ("s1x/r2_c3_a.tif", r#"after "s1" comes "x" where nothing more should be"#),
+        ("s1/r2-c3_a.tif", r#"after "r2" comes "-c3_a.tif" where "_c" should be"#),
+        ("s1/r2_c3_a.tiff", r#"after "r2_c3_a.tif" comes "f" where nothing more should be"#),
+        ("s1/r2_c3_a.png", r#"after "r2_c3_" comes "a.png" where ".tif" should be"#),
+        ("s1/r2_c3_.tif", r#"after "r2_c3_" comes ".tif" where a name for {channel} should be"#),
+        ("s1/r2_c3", r#""r2_c3" ends where "_" should be"#),
+        ("s1", "it lies 0 folders deep, the pattern's files 1"),
+    ] {
+        assert_eq!(why(path), said, "{path}");
+    }
+    assert_eq!(deep.mismatch("s1/r2_c3_a.tif", false), None);
+    assert_eq!(deep.mismatch("s1", true), None);
+
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    fs::create_dir_all(scope.join("s4")).unwrap();
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    assert_eq!(watch.unmatched(), None, "nothing is there yet");
+    fs::create_dir(scope.join("section 1")).unwrap();
+    looks(&mut watch);
+    let said = watch.unmatched().unwrap();
+    assert!(said.contains(r#"such as "section 1": after "s" comes"#), "{said}");
+    fs::write(scope.join("s4/r1.tif"), "").unwrap();
+    fs::write(scope.join("s4/.hidden"), "").unwrap();
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    let said = watch.unmatched().unwrap();
+    for part in [
+        "s{section}/r{row}_c{column}_{channel}.tif",
+        "2 files and 2 folders",
+        r#"such as "s4/r1.tif": after "r1" comes ".tif" where "_c" should be"#,
+    ] {
+        assert!(said.contains(part), "{part:?} is not in: {said}");
+    }
+    image(&scope.join("s4/r1_c1_a.tif"), 32, 1);
+    looks(&mut watch);
+    assert_eq!(watch.unmatched(), None);
 }
 
 #[test]

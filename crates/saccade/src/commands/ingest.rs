@@ -212,6 +212,9 @@ impl Ingest {
             acquisition = kept;
             if self.once {
                 watch::run(&mut watch, true, &cancel)?;
+                if let Some(why) = watch.unmatched() {
+                    anyhow::bail!("{why}; give --pattern as the files are named");
+                }
             } else {
                 let cancel = cancel.clone();
                 let looks = move || watch::run(&mut watch, false, &cancel);
