@@ -109,6 +109,19 @@ pub enum ReplayError {
         /// The list.
         list: PathBuf,
     },
+    /// Registration is there, but not what was registered.
+    #[error(
+        "this TrakEM2 project says where registration put {images} images that are here, but there is no list of \
+         where the stage had them; put the list from which it was made (`file x y z` per line) into the folder, or \
+         take the project out of it to see the images as a stack: {}",
+        project.display()
+    )]
+    NoList {
+        /// How many of its images are there.
+        images: usize,
+        /// The project.
+        project: PathBuf,
+    },
     /// The folder is what replay and simulator write.
     #[error("this already is an acquisition archive; use `saccade ingest` on it: {}", path.display())]
     AlreadyArchive {

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use saccade_archive::acquisition::tile_list::{Images, ListedTile};
-use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
+use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, trakem2};
 
 use super::acquisition::median_offset;
 use super::lists::{self, List, Solution};
@@ -75,6 +75,9 @@ impl Input {
 /// - A stack is the path itself if it can be read as one; else the folder below with section images
 ///   whose name speaks of raw images rather than of labels, then the one with most sections, then
 ///   the first by name.
+///
+/// A folder with a list is no stack: one that has a line that makes no sense, or that names images which are not
+/// there, is an error, and so is a TrakEM2 project whose list is missing.
 ///
 /// # Errors
 ///
@@ -147,16 +150,24 @@ impl Tree {
 
 fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, ReplayError> {
     let images = Images::below(folder)?;
-    let small = |path: &&Path| fs::metadata(path).is_ok_and(|meta| meta.len() <= LARGEST_LIST);
-    let mut incomplete = None;
+    let (mut incomplete, mut unreadable) = (None, None);
     let text = tree.with_extension("txt");
     for list in text.chain(tree.with_extension("json")).filter(small) {
         if lists::is_registered(list) {
             continue;
         }
-        // Most files are no lists; that is no error.
-        let Ok(listed) = lists::read(list) else {
-            continue;
+        let listed = match lists::read(list) {
+            Ok(listed) => listed,
+            Err(error) if lists::is_meant(list, &images) => {
+                // Text is surely a list; of JSON, another file may be the one that is meant.
+                if list.extension().is_some_and(|e| e.eq_ignore_ascii_case("txt")) {
+                    return Err(error.into());
+                }
+                unreadable.get_or_insert(error);
+                continue;
+            }
+            // Most files are no lists; that is no error.
+            Err(_) => continue,
         };
         let tiles = &listed.tiles;
         let here = tiles
@@ -166,15 +177,45 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
         if found > 0 && found == tiles.len() {
             return Ok(Some(with_solution(folder, tree, &images, list, listed)?));
         }
-        if found > 0 && incomplete.is_none() {
+        let counts = found > 0 || lists::is_certain(list, tiles);
+        if counts && incomplete.is_none() {
             incomplete = Some((list.to_owned(), listed.tiles));
         }
     }
-    match incomplete {
+    match (incomplete, unreadable) {
+        (_, Some(error)) => Err(error.into()),
         // Says which images are missing.
-        Some((list, listed)) => Acquisition::new(folder, &images, &list, &listed, None).map(Some),
-        None => Ok(None),
+        (Some((list, listed)), None) => {
+            Acquisition::new(folder, &images, &list, &listed, None).map(Some)
+        }
+        (None, None) => refuse_project_alone(tree, &images).map(|()| None),
     }
+}
+
+/// Where a project is, there was a list from which it was made.
+fn refuse_project_alone(tree: &Tree, images: &Images) -> Result<(), ReplayError> {
+    for path in projects(tree) {
+        let patches = trakem2::read(path)?;
+        let here = |patch: &&trakem2::Patch| images.find(&patch.file).is_some();
+        let here = patches.iter().filter(here).count();
+        if here > 0 {
+            return Err(ReplayError::NoList {
+                images: here,
+                project: path.to_owned(),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// Projects of TrakEM2.
+fn projects(tree: &Tree) -> impl Iterator<Item = &Path> {
+    let files = tree.with_extension("xml").filter(small);
+    files.filter(|path| lists::is_project(path))
+}
+
+fn small(path: &&Path) -> bool {
+    fs::metadata(path).is_ok_and(|meta| meta.len() <= LARGEST_LIST)
 }
 
 fn with_solution(
@@ -191,8 +232,11 @@ fn with_solution(
         return Ok(unsolved);
     }
     let mut best: Option<Solution> = None;
-    let projects = tree.with_extension("xml").map(Solution::read);
-    for solution in listed.solution.into_iter().chain(projects.flatten()) {
+    let mut solutions = Vec::from_iter(listed.solution);
+    for project in projects(tree) {
+        solutions.push(Solution::read(project)?);
+    }
+    for solution in solutions {
         let has = |name: &&str| solution.transforms.contains_key(*name);
         if !wanted.iter().all(has) || !refines(&unsolved, &solution) {
             continue;

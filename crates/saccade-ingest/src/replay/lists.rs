@@ -1,10 +1,12 @@
 //! Files that say where the tiles of an acquisition lie, whatever program wrote them.
 
 use std::collections::BTreeMap;
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use glam::DVec2;
-use saccade_archive::acquisition::tile_list::{self, ListedTile};
+use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
 use saccade_archive::acquisition::tile_specs::{self, TileSpec};
 use saccade_archive::acquisition::trakem2::{self, Patch};
 use saccade_archive::acquisition::{AcquisitionError, tile_configuration};
@@ -65,16 +67,98 @@ pub(super) fn read(path: &Path) -> Result<List, AcquisitionError> {
         Ok(tiles) => {
             let registered = tile_configuration::registered(path);
             let solution = match tile_configuration::read(&registered) {
-                Ok(tiles) if path != registered => Some(of_corners(&registered, &tiles)),
-                _ => None,
+                _ if path == registered => None,
+                Ok(tiles) => Some(of_corners(&registered, &tiles)),
+                Err(AcquisitionError::Read { source, .. })
+                    if source.kind() == io::ErrorKind::NotFound =>
+                {
+                    None
+                }
+                Err(error) => return Err(error),
             };
             Ok(List { tiles, solution })
         }
-        Err(_) => Ok(List {
-            tiles: tile_list::read(path)?,
-            solution: None,
-        }),
+        Err(wrong) => match tile_list::read(path) {
+            // An empty one is a list of no tiles, but no configuration.
+            Ok(tiles) if !tiles.is_empty() || !is_configuration(path) => Ok(List {
+                tiles,
+                solution: None,
+            }),
+            Ok(_) => Err(wrong),
+            Err(_) if is_configuration(path) => Err(wrong),
+            Err(error) => Err(error),
+        },
     }
+}
+
+/// Whether Fiji's plugins call a file so, or it holds lines like theirs.
+fn is_configuration(path: &Path) -> bool {
+    let text = fs::read(path).unwrap_or_default();
+    let text = String::from_utf8_lossy(&text);
+    is_called_configuration(path) || text.lines().any(|line| configured(line).is_some())
+}
+
+fn is_called_configuration(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.to_lowercase().starts_with("tileconfiguration")
+}
+
+/// The image that a line of a tile configuration names, however wrong its place is.
+fn configured(line: &str) -> Option<&str> {
+    let (file, place) = line.split_once(';')?;
+    let place = place.trim_end();
+    (place.contains('(') && place.ends_with(')')).then(|| file.trim())
+}
+
+/// Whether a file that cannot be read is meant to be a list: it has a line like a list's, about an image that is
+/// there. Prose and tables of other things have none.
+pub(super) fn is_meant(path: &Path, images: &Images) -> bool {
+    let text = fs::read(path).unwrap_or_default();
+    let text = String::from_utf8_lossy(&text);
+    if path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("json"))
+    {
+        let has = |word| text.contains(word);
+        return text.trim_start().starts_with('[')
+            && has("\"tileId\"")
+            && has("\"mipmapLevels\"");
+    }
+    let is_there = |file: &str| !file.is_empty() && images.find(file).is_some();
+    let listed = |line: &str| {
+        // One number may be wrong, or missing.
+        [2, 3].into_iter().any(|columns| {
+            let mut rest = line.trim();
+            let mut numbers = 0;
+            for _ in 0..columns {
+                let Some((before, last)) = rest.rsplit_once(char::is_whitespace) else {
+                    return false;
+                };
+                numbers += usize::from(last.parse::<f64>().is_ok());
+                rest = before.trim_end();
+            }
+            numbers >= 2 && is_there(rest)
+        })
+    };
+    let about = |line| configured(line).is_some_and(is_there) || listed(line);
+    is_called_configuration(path) || text.lines().any(about)
+}
+
+/// Whether a list that names no image that is there is one nevertheless, of images that were renamed or left
+/// behind.
+pub(super) fn is_certain(path: &Path, tiles: &[ListedTile]) -> bool {
+    let image = |tile: &ListedTile| {
+        let name = tile.file.to_lowercase();
+        let kinds = [".tif", ".tiff", ".png", ".jpg", ".jpeg"];
+        kinds.iter().any(|kind| name.ends_with(kind))
+    };
+    !tiles.is_empty() && (tiles.iter().all(image) || is_configuration(path))
+}
+
+/// Whether a file is a project of TrakEM2 with images, readable or not.
+pub(super) fn is_project(path: &Path) -> bool {
+    let text = fs::read(path).unwrap_or_default();
+    text.windows(8).any(|word| word == b"t2_patch")
 }
 
 fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {

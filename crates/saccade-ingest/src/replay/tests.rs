@@ -339,6 +339,105 @@ fn what_cannot_be_used_is_said() {
     ));
 }
 
+/// A folder with a list is an acquisition, whatever is wrong with the list: never a stack of its images.
+#[test]
+fn a_list_that_makes_no_sense_is_no_stack() {
+    let plain = "a.tif 0 0 0\nb.tif 25 0 0\n";
+    let fiji = "dim = 2\na.tif; ; (0, 0)\nb.tif; ; (25, 0)\n";
+    let stage = r#""layout": {"stageX": 0, "stageY": 0}"#;
+    let spec = |name: &str, width: &str| {
+        format!(
+            r#"{{"tileId": "{name}", "z": 0, "width": {width}, "height": 20, {stage},
+                "mipmapLevels": {{"0": {{"imageUrl": "{name}.tif"}}}}, "transforms": {{"specList": []}}}}"#
+        )
+    };
+    let specs = format!("[{}, {}]", spec("a", "30"), spec("b", "-30"));
+    let broken: [(&str, String, &str); 12] = [
+        ("list.txt", plain.replace("25", "x"), "line 2: x is \"x\""),
+        ("list.txt", plain.replace("25", "nan"), "line 2: x is \"nan\""),
+        ("list.txt", plain.replace("a.tif 0 0 0", "a.tif 0 0"), "line 1: "),
+        ("list.txt", plain.replace("0\nb", "0.5\nb"), "line 1: z is \"0.5\""),
+        ("list.txt", format!("# stage\n{plain}the end\n"), "line 4: "),
+        ("list.txt", "a.tif nan 0 0\n".to_owned(), "line 1: x is \"nan\""),
+        ("TileConfiguration.txt", fiji.replace("25", "nan"), "line 3: "),
+        ("tiles.txt", fiji.replace("(25", "(2 5"), "line 3: "),
+        ("TileConfiguration.txt", fiji.replace("dim = 2\n", ""), "line 1: "),
+        ("TileConfiguration.txt", String::new(), "line 1: "),
+        ("TileConfiguration.registered.txt", fiji.replace("25", "nan"), "line 3: "),
+        ("specs.json", specs, "tile \"b\": width is -30"),
+    ];
+    for (file, text, said) in broken {
+        let folder = two_pictures();
+        if file.contains("registered") {
+            fs::write(folder.path().join("TileConfiguration.txt"), fiji).unwrap();
+        }
+        let path = folder.path().join(file);
+        fs::write(&path, &text).unwrap();
+        let error = detect(folder.path()).unwrap_err();
+        let ReplayError::Acquisition { source } = &error else {
+            panic!("{text}: {error:?}")
+        };
+        let told = source.to_string();
+        assert!(told.starts_with(said), "{text}: {told}");
+        assert!(told.ends_with(&path.display().to_string()), "{told}");
+    }
+    // Lists of images that are elsewhere.
+    for (file, text) in [
+        ("list.txt", plain.replace(".tif", "2.tif")),
+        ("TileConfiguration.txt", fiji.replace(".tif", "2.tif")),
+        ("what.txt", fiji.replace(".tif", ".raw")),
+    ] {
+        let folder = two_pictures();
+        fs::write(folder.path().join(file), text).unwrap();
+        let error = detect(folder.path()).unwrap_err();
+        let missing = matches!(error, ReplayError::MissingImages { missing: 2, .. });
+        assert!(missing, "{file}: {error:?}");
+    }
+    // Prose about the images, and tables of something else.
+    for text in [
+        "a.tif is the first section, b.tif the second\n",
+        "threshold 3 4 5\nsigma 1 1 x\n",
+        "x y z\n1 2 3\n",
+        "a.tif\nb.tif\n",
+    ] {
+        let folder = two_pictures();
+        fs::write(folder.path().join("notes.txt"), text).unwrap();
+        let found = detect(folder.path()).unwrap();
+        assert!(matches!(found, Input::Stack { .. }), "{text}: {found:?}");
+    }
+}
+
+#[test]
+fn a_project_without_its_list_is_no_stack() {
+    let folder = acquisition();
+    fs::remove_file(folder.path().join("list.txt")).unwrap();
+    let error = detect(folder.path()).unwrap_err();
+    let told = error.to_string();
+    assert!(matches!(error, ReplayError::NoList { images: 4, .. }), "{error:?}");
+    assert!(told.contains("file x y z") && told.contains("a_same.xml"), "{told}");
+
+    // One that cannot be read is not passed over, with a list or without.
+    let folder = acquisition();
+    let project = folder.path().join("c_refined.xml");
+    let text = fs::read_to_string(&project).unwrap();
+    fs::write(&project, text.replace("0.01", "nought")).unwrap();
+    for _ in 0..2 {
+        let error = detect(folder.path()).unwrap_err();
+        let ReplayError::Acquisition { source } = &error else {
+            panic!("{error:?}")
+        };
+        let told = source.to_string();
+        assert!(told.contains("nought") && told.contains("c_refined.xml"), "{told}");
+        fs::write(folder.path().join("list.txt"), "").unwrap();
+        fs::remove_file(folder.path().join("a_same.xml")).unwrap_or_default();
+        fs::remove_file(folder.path().join("b_part.xml")).unwrap_or_default();
+    }
+    // Other XML is no project.
+    let folder = two_pictures();
+    fs::write(folder.path().join("microscope.xml"), "<scope>").unwrap();
+    assert!(matches!(detect(folder.path()).unwrap(), Input::Stack { .. }));
+}
+
 #[test]
 fn of_several_folders_the_raw_images_are_the_stack() {
     let folder = tempfile::tempdir().unwrap();
