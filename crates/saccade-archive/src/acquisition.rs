@@ -11,14 +11,20 @@
 //! stack, [`trakem2`] the affine transforms of a TrakEM2 project.
 //!
 //! Reading never changes the archive. Unknown fields are ignored, so that a microscope may say
-//! more than is understood here.
+//! more than is understood here; but one of `volume.json` that is spelt almost as a known one is refused, for
+//! then something else than what was meant would be taken in.
+//!
+//! A link that leads out of the folder is not followed, be it an image or the records: whoever writes the folder
+//! would show files that are another's. The folder itself may be one.
 
+mod key;
 mod record;
 pub mod tile_configuration;
 pub mod tile_list;
 pub mod tile_specs;
 pub mod trakem2;
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::{Component, Path, PathBuf};
@@ -73,6 +79,38 @@ pub enum AcquisitionError {
         /// Where it stops making sense.
         source: serde_json::Error,
         /// File.
+        path: PathBuf,
+    },
+    /// `volume.json` has a key that is almost a known one.
+    #[error(
+        "{key:?} means nothing in {}; is {meant:?} meant? What counts is {}; a key of your own needs a name \
+         that is less like them",
+        path.display(), key::KNOWN.join(", ")
+    )]
+    Key {
+        /// As it is there.
+        key: String,
+        /// The one it is like.
+        meant: &'static str,
+        /// File.
+        path: PathBuf,
+    },
+    /// Channels of `volume.json` that cannot be told apart.
+    #[error("{mistake}; mend \"channels\" in {}", path.display())]
+    Channels {
+        /// What is wrong with them.
+        mistake: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// A file is a link to somewhere else.
+    #[error(
+        "this is a link that leads out of the acquisition's folder, and is not followed; put the file itself \
+         there: {}",
+        path.display()
+    )]
+    LeadsOut {
+        /// The link.
         path: PathBuf,
     },
     /// The records were cut or replaced, although they are only ever appended to.
@@ -189,7 +227,8 @@ impl AcquisitionInfo {
     ///
     /// # Errors
     ///
-    /// [`AcquisitionError::NoInfo`], [`AcquisitionError::Read`], [`AcquisitionError::Info`].
+    /// [`AcquisitionError::NoInfo`], [`AcquisitionError::Read`], [`AcquisitionError::LeadsOut`], and
+    /// [`AcquisitionError::Info`], [`AcquisitionError::Key`] or [`AcquisitionError::Channels`] for what it says.
     pub fn read(folder: &Path) -> Result<Self, AcquisitionError> {
         let path = folder.join(Self::FILE);
         // The folder first: "you may not look in here" is not "there is nothing here".
@@ -197,6 +236,7 @@ impl AcquisitionInfo {
             source,
             path: folder.to_owned(),
         })?;
+        refuse_link_out(&path)?;
         let text = match fs::read(&path) {
             Ok(text) => text,
             Err(e) if e.kind() == io::ErrorKind::NotFound => {
@@ -206,7 +246,33 @@ impl AcquisitionInfo {
             }
             Err(source) => return Err(AcquisitionError::Read { source, path }),
         };
-        serde_json::from_slice(&text).map_err(|source| AcquisitionError::Info { source, path })
+        if let Some((key, meant)) = key::misspelt(&text) {
+            return Err(AcquisitionError::Key { key, meant, path });
+        }
+        let info: Self = match serde_json::from_slice(&text) {
+            Ok(info) => info,
+            Err(source) => return Err(AcquisitionError::Info { source, path }),
+        };
+        match info.channel_mistake() {
+            Some(mistake) => Err(AcquisitionError::Channels { mistake, path }),
+            None => Ok(info),
+        }
+    }
+
+    /// What is wrong with the channels' names, by which tiles name them; `None` if nothing is.
+    pub fn channel_mistake(&self) -> Option<String> {
+        let mut known = BTreeSet::new();
+        for name in &self.channels {
+            if name.trim().is_empty() {
+                return Some("a channel has an empty name, by which no tile can name it".to_owned());
+            }
+            if !known.insert(name) {
+                return Some(format!(
+                    "two channels are called {name:?}, and no tile could name the second"
+                ));
+            }
+        }
+        None
     }
 
     /// Writes it into an acquisition archive, whole or not at all. The folder is made if missing.
@@ -238,6 +304,32 @@ impl AcquisitionInfo {
         }
         Ok(volume)
     }
+}
+
+/// Whether a path, links followed, lies below a folder, links followed. What is not there leads nowhere.
+fn stays_below(path: &Path, folder: &Path) -> bool {
+    match (path.canonicalize(), folder.canonicalize()) {
+        (Ok(path), Ok(folder)) => path.starts_with(folder),
+        _ => true,
+    }
+}
+
+/// Refuses a file that is a link out of its folder.
+fn refuse_link_out(path: &Path) -> Result<(), AcquisitionError> {
+    let is_link = fs::symlink_metadata(path).is_ok_and(|meta| meta.is_symlink());
+    let folder = path.parent().filter(|_| is_link);
+    if folder.is_some_and(|folder| !stays_below(path, folder)) {
+        return Err(AcquisitionError::LeadsOut {
+            path: path.to_owned(),
+        });
+    }
+    Ok(())
+}
+
+/// Whether an image that a record names lies in the archive's folder, or in `linked`, wherever links on its way
+/// lead. One that is not there yet does.
+pub fn is_inside(image: &Path, folder: &Path, linked: Option<&Path>) -> bool {
+    stays_below(image, folder) || linked.is_some_and(|linked| stays_below(image, linked))
 }
 
 /// The path of an image that a record names, or `None` if the name leads out of the archive.
@@ -318,6 +410,104 @@ mod tests {
             (volume.dtype, volume.channels),
             (Dtype::Uint16, info.channels)
         );
+    }
+
+    #[test]
+    fn keys_that_are_almost_known_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let read = |more: &str| {
+            let text = format!(
+                r#"{{"name":"cortex","extent":[10,20,3],"voxel_nm":[4,4,40]{more}}}"#
+            );
+            fs::write(folder.path().join(AcquisitionInfo::FILE), text).unwrap();
+            AcquisitionInfo::read(folder.path())
+        };
+        for (key, want) in [
+            ("chanels", "channels"),
+            ("channel", "channels"),
+            ("Channels", "channels"),
+            ("dType", "dtype"),
+            ("type", "dtype"),
+            ("kinds", "kind"),
+            ("voxel-nm", "voxel_nm"),
+        ] {
+            let refused = read(&format!(r#","{key}":["SE"]"#)).unwrap_err();
+            let told = refused.to_string();
+            assert!(
+                matches!(refused, AcquisitionError::Key { meant, .. } if meant == want),
+                "{key}: {told}"
+            );
+            for part in [key, want, "volume.json", "name, extent, voxel_nm, dtype"] {
+                assert!(told.contains(part), "{part:?} is not in: {told}");
+            }
+        }
+        // In place of one that is needed.
+        let text = r#"{"name":"cortex","extents":[10,20,3],"voxel_nm":[4,4,40]}"#;
+        fs::write(folder.path().join(AcquisitionInfo::FILE), text).unwrap();
+        let refused = AcquisitionInfo::read(folder.path()).unwrap_err();
+        assert!(matches!(refused, AcquisitionError::Key { meant: "extent", .. }));
+        // What a microscope says besides is its own.
+        let own = r#","kV":1.5,"date":"May","operator":{"kinds":1},"stage":[1],"sample":"x","size":3"#;
+        assert!(read(own).is_ok());
+        // Twice is not once.
+        let twice = read(r#","dtype":"uint8","dtype":"uint16""#).unwrap_err();
+        assert!(matches!(twice, AcquisitionError::Info { .. }), "{twice}");
+    }
+
+    #[test]
+    fn channels_have_names_of_their_own() {
+        let folder = tempfile::tempdir().unwrap();
+        for (channels, part) in [
+            (r#"["SE","BSE","SE"]"#, "\"SE\""),
+            (r#"["SE",""]"#, "empty"),
+            (r#"[" "]"#, "empty"),
+        ] {
+            let text = format!(
+                r#"{{"name":"v","extent":[1,2,3],"voxel_nm":[4,4,40],"channels":{channels}}}"#
+            );
+            fs::write(folder.path().join(AcquisitionInfo::FILE), text).unwrap();
+            let refused = AcquisitionInfo::read(folder.path()).unwrap_err();
+            assert!(matches!(refused, AcquisitionError::Channels { .. }));
+            let told = refused.to_string();
+            assert!(told.contains(part) && told.contains("volume.json"), "{told}");
+        }
+    }
+
+    #[test]
+    fn links_out_of_the_archive_are_not_followed() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().unwrap();
+        let (archive, elsewhere) = (folder.path().join("a"), folder.path().join("b"));
+        let info = AcquisitionInfo::new("v", UVec3::ONE, DVec3::ONE);
+        info.write(&elsewhere).unwrap();
+        fs::write(elsewhere.join(RecordReader::FILE), "secret\n").unwrap();
+        fs::create_dir(&archive).unwrap();
+        for file in [AcquisitionInfo::FILE, RecordReader::FILE] {
+            symlink(elsewhere.join(file), archive.join(file)).unwrap();
+        }
+        let refused = AcquisitionInfo::read(&archive).unwrap_err();
+        assert!(matches!(refused, AcquisitionError::LeadsOut { .. }), "{refused}");
+        let mut reader = RecordReader::new(&archive, Cursor::default());
+        let refused = reader.read(1).unwrap_err();
+        assert!(matches!(refused, AcquisitionError::LeadsOut { .. }), "{refused}");
+        // The folder itself may be a link, and links within it are its own.
+        let link = folder.path().join("link");
+        symlink(&elsewhere, &link).unwrap();
+        fs::rename(elsewhere.join(RecordReader::FILE), elsewhere.join("today")).unwrap();
+        symlink("today", elsewhere.join(RecordReader::FILE)).unwrap();
+        assert_eq!(AcquisitionInfo::read(&link).unwrap(), info);
+        let mut reader = RecordReader::new(&link, Cursor::default());
+        assert_eq!(reader.read(1).unwrap().len(), 1);
+        // Images as well, and in the one folder besides that may be looked into.
+        symlink(elsewhere.join("today"), archive.join("image")).unwrap();
+        symlink(&elsewhere, archive.join("deep")).unwrap();
+        for image in ["image", "deep/today"].map(|file| archive.join(file)) {
+            assert!(!is_inside(&image, &archive, None));
+            assert!(!is_inside(&image, &archive, Some(&folder.path().join("a"))));
+            assert!(is_inside(&image, &archive, Some(&elsewhere)));
+        }
+        assert!(is_inside(&link.join("today"), &link, None));
+        assert!(is_inside(&archive.join("missing"), &archive, None));
     }
 
     #[test]

@@ -224,6 +224,12 @@ impl<F: Folders> Watch<F> {
         Ok(watch)
     }
 
+    /// The folder that is watched: where links of the records lead, see
+    /// [`IngestOptions::linked`](crate::ingest::IngestOptions::linked).
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
     /// Whether this process writes the records. If not, another does that watches the same folder, until it ends.
     pub fn leads(&self) -> bool {
         self.list.is_some()

@@ -8,7 +8,7 @@ use glam::UVec2;
 use saccade_core::transform::SectionFromTile;
 use serde::{Deserialize, Serialize};
 
-use super::AcquisitionError;
+use super::{AcquisitionError, refuse_link_out};
 
 /// Bytes a line may have; a longer one is broken.
 const MAX_LINE: usize = 1 << 16;
@@ -200,6 +200,9 @@ impl RecordReader {
     /// The file at the cursor, and what lies before it; `None` if there is no file yet.
     fn open(&self) -> io::Result<Result<Option<(File, Prefix)>, AcquisitionError>> {
         let Cursor { offset, line, seen } = self.cursor;
+        if let Err(leads_out) = refuse_link_out(&self.path) {
+            return Ok(Err(leads_out));
+        }
         let mut file = match File::open(&self.path) {
             Ok(file) => file,
             Err(e) if e.kind() == io::ErrorKind::NotFound && offset == 0 => return Ok(Ok(None)),

@@ -50,8 +50,36 @@ pub(super) fn kind(bytes: &[u8]) -> Result<Kind, ImageError> {
         return Err(incomplete("its beginning has not been written"));
     }
     Err(ImageError::Unsupported {
-        what: format!("its first bytes are {begin:02x?}"),
+        what: other_kind(bytes).to_owned(),
     })
+}
+
+/// What a file is that is no image of ours. None of its bytes are told: messages go to whoever may look at the
+/// volume, and the file may be one that was never meant for them.
+fn other_kind(bytes: &[u8]) -> &'static str {
+    let known: [(&[u8], &str); 12] = [
+        (b"GIF8", "a GIF"),
+        (b"BM", "a BMP"),
+        (b"RIFF", "a WebP, or sound or film"),
+        (b"\0\0\0\x0cjP  ", "a JPEG 2000"),
+        (b"\x89HDF", "an HDF5 file"),
+        (b"SIMPLE  ", "a FITS file"),
+        (b"PK\x03\x04", "a ZIP archive"),
+        (b"\x1f\x8b", "a file packed with gzip"),
+        (b"\xd0\xcf\x11\xe0", "a microscope's or an office's compound file"),
+        (b"ZISRAW", "a CZI"),
+        (b"%PDF", "a PDF"),
+        (b"8BPS", "a Photoshop file"),
+    ];
+    if let Some((_, kind)) = known.iter().find(|(magic, _)| bytes.starts_with(magic)) {
+        return kind;
+    }
+    let begin = &bytes[..bytes.len().min(16)];
+    if begin.iter().all(|&b| b.is_ascii_graphic() || b.is_ascii_whitespace()) {
+        "text"
+    } else {
+        "of no format that is known here"
+    }
 }
 
 /// Checks that a PNG file's chunks go on to its last.
@@ -149,5 +177,19 @@ mod tests {
             kind(b"GIF89a"),
             Err(ImageError::Unsupported { .. })
         ));
+        // Messages tell what it seems to be, and nothing that is in it.
+        for (bytes, what) in [
+            (&b"GIF89a"[..], "a GIF"),
+            (b"root:x:0:0:root", "text"),
+            (b"\x7fELF\x02\x01\x01\0", "no format that is known"),
+        ] {
+            let told = kind(bytes).unwrap_err().to_string();
+            assert!(told.contains(what), "{told}");
+            let inside = [String::from_utf8_lossy(&bytes[..4]).into_owned(), format!("{:02x?}", &bytes[..2])];
+            assert!(
+                what == "a GIF" || !inside.iter().any(|inside| told.contains(inside)),
+                "{told}"
+            );
+        }
     }
 }

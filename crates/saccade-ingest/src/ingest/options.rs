@@ -1,3 +1,4 @@
+use std::path::PathBuf;
 use std::time::Duration;
 
 use saccade_archive::pyramid::Encoding;
@@ -7,6 +8,9 @@ use saccade_archive::pyramid::Encoding;
 pub struct IngestOptions {
     /// Name of the volume in the catalog; `None`: as the acquisition archive says.
     pub volume: Option<String>,
+    /// A folder besides the acquisition archive's into which links to images may lead: the one that is watched,
+    /// where a [`Watch`](crate::watch::Watch) keeps the records.
+    pub linked: Option<PathBuf>,
     /// How pyramids are stored.
     pub encoding: Encoding,
     /// Pause between looks at the acquisition archive.
@@ -35,6 +39,7 @@ impl IngestOptions {
     /// What fits most.
     pub const DEFAULT: Self = Self {
         volume: None,
+        linked: None,
         encoding: Encoding::Jpeg { quality: 85 },
         poll: Duration::from_millis(250),
         once: false,

@@ -7,7 +7,7 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
-use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord, image_path};
+use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord, image_path, is_inside};
 use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
@@ -134,6 +134,8 @@ impl Stored {
 /// What all records share.
 pub(super) struct Context<'a> {
     pub(super) folder: &'a Path,
+    /// Into which links may lead besides.
+    pub(super) linked: Option<&'a Path>,
     pub(super) volume: &'a str,
     pub(super) extent: UVec3,
     /// Names of the volume's channels.
@@ -156,6 +158,12 @@ impl Context<'_> {
                           into the archive and name it relative to its folder";
             return Ok(quarantine(&record, reason.to_owned(), None, None));
         };
+        if !is_inside(&path, self.folder, self.linked) {
+            let reason = "the image is a link, or lies behind one, that leads out of the acquisition \
+                          archive; such links are not followed: put the image itself there, and append the \
+                          record again";
+            return Ok(quarantine(&record, reason.to_owned(), None, None));
+        }
         let (section, size, transform) = (record.section, record.size, record.transform);
         let before = look(&path);
         let bytes = before.map(|l| l.bytes);

@@ -112,6 +112,7 @@ pub async fn run(
         options,
         context: Context {
             folder: acquisition,
+            linked: options.linked.as_deref(),
             volume: &volume.name,
             extent: volume.extent(),
             channels: &volume.channels,

@@ -138,16 +138,17 @@ async fn follow(
     let cancel = Cancel::new();
     let _ended = Ended(cancel.clone());
     let mut watch = bare.watch();
-    let looks = tokio::task::spawn_blocking({
-        let cancel = cancel.clone();
-        move || watch::run(&mut watch, false, &cancel)
-    });
     let options = IngestOptions {
+        linked: Some(watch.folder().to_owned()),
         once: false,
         patience: 100_000,
         keep_retired: Duration::ZERO,
         ..quick()
     };
+    let looks = tokio::task::spawn_blocking({
+        let cancel = cancel.clone();
+        move || watch::run(&mut watch, false, &cancel)
+    });
     let kept = bare.kept();
     let work = run(&kept, archive, &options, diary, &cancel);
     let end = async {
@@ -296,6 +297,7 @@ async fn two_watchers_that_are_killed_tell_all_once() {
     assert!(watch.leads(), "the dead keep nothing");
     watch::run(&mut watch, true, &Cancel::new()).unwrap();
     let last = IngestOptions {
+        linked: Some(watch.folder().to_owned()),
         attempts: u32::MAX,
         keep_retired: Duration::ZERO,
         ..quick()
@@ -312,8 +314,10 @@ async fn child(folder: &Path) {
     let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
     let cancel = Cancel::new();
     std::io::stdout().write_all(b"\nat work\n").unwrap();
+    let linked = Some(watch.folder().to_owned());
     let looks = tokio::task::spawn_blocking(move || watch::run(&mut watch, false, &cancel));
     let options = IngestOptions {
+        linked,
         once: false,
         patience: 100_000,
         attempts: u32::MAX,

@@ -10,7 +10,7 @@ use saccade_ingest::ingest::run;
 
 use crate::scope::{
     Diary, EXTENT, Scope, VOLUME, archive, at, move_record, orphans, pixels, quick, seen, texture,
-    tiff_rgb, tiff16, tile_record,
+    tiff_rgb, tiff8, tiff16, tile_record,
 };
 
 const SIZE: UVec2 = UVec2::new(140, 130);
@@ -74,6 +74,35 @@ async fn a_16_bit_tile() {
     );
     assert_eq!(what.bytes, Some(len));
     says(&what, &["16", "8"]);
+}
+
+/// What a link shows is not the microscope's, and none of it is told.
+#[tokio::test]
+async fn a_link_out_of_the_archive() {
+    let elsewhere = tempfile::tempdir().unwrap();
+    let secret = elsewhere.path().join("secret");
+    for whole in [true, false] {
+        let image = tiff8(SIZE, &texture(SIZE, 3));
+        let bytes = if whole { &image[..] } else { b"root:x:0:0" };
+        fs::write(&secret, bytes).unwrap();
+        for folder in [false, true] {
+            let what = refused(|scope| {
+                let Record::Tile(mut record) = tile_record("link", 0, SIZE) else {
+                    panic!("a tile")
+                };
+                if folder {
+                    std::os::unix::fs::symlink(elsewhere.path(), scope.path().join("deep")).unwrap();
+                    record.file = "deep/secret".to_owned();
+                } else {
+                    std::os::unix::fs::symlink(&secret, scope.file("link")).unwrap();
+                }
+                scope.say(&Record::Tile(record));
+            })
+            .await;
+            assert_eq!((what.tile.as_deref(), what.bytes), (Some("link"), None));
+            says(&what, &["link", "leads out", "put the image itself there"]);
+        }
+    }
 }
 
 #[tokio::test]

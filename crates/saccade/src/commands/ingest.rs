@@ -107,6 +107,9 @@ impl Bare {
             Some(16) => Dtype::Uint16,
             Some(bits) => anyhow::bail!("voxels have 8 or 16 bits, not {bits}"),
         };
+        if let Some(mistake) = info.channel_mistake() {
+            anyhow::bail!("{mistake}; name each once with --channels");
+        }
         Ok(Some(WatchConfig {
             pattern: pattern.clone(),
             info,
@@ -182,7 +185,7 @@ impl Ingest {
             archive = opened => archive?,
             () = cancel.cancelled() => return Ok(()),
         };
-        let options = IngestOptions {
+        let mut options = IngestOptions {
             volume: self.volume,
             encoding: self.stored.encoding(),
             once: self.once,
@@ -210,6 +213,7 @@ impl Ingest {
                 );
             }
             acquisition = kept;
+            options.linked = Some(watch.folder().to_owned());
             if self.once {
                 watch::run(&mut watch, true, &cancel)?;
                 if let Some(why) = watch.unmatched() {
