@@ -60,8 +60,10 @@ pub enum AcquisitionError {
     },
     /// The folder holds no `volume.json`.
     #[error(
-        "this folder is no acquisition archive: it has no {}; the microscope's software writes it \
-         before the first tile, and so does `saccade simulate`: {}",
+        "this folder is no acquisition archive: it has no {}, which the microscope's software writes before the \
+         first tile. Images whose names say where they lie are taken in with --pattern; of a stack, or of tiles with \
+         a list of their places, `saccade simulate ACQUISITION --input FOLDER` makes an acquisition, and \
+         `saccade demo --input FOLDER` shows it at once: {}",
         AcquisitionInfo::FILE, path.display()
     )]
     NoInfo {
@@ -264,7 +266,9 @@ impl AcquisitionInfo {
         let mut known = BTreeSet::new();
         for name in &self.channels {
             if name.trim().is_empty() {
-                return Some("a channel has an empty name, by which no tile can name it".to_owned());
+                return Some(
+                    "a channel has an empty name, by which no tile can name it".to_owned(),
+                );
             }
             if !known.insert(name) {
                 return Some(format!(
@@ -416,9 +420,8 @@ mod tests {
     fn keys_that_are_almost_known_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let read = |more: &str| {
-            let text = format!(
-                r#"{{"name":"cortex","extent":[10,20,3],"voxel_nm":[4,4,40]{more}}}"#
-            );
+            let text =
+                format!(r#"{{"name":"cortex","extent":[10,20,3],"voxel_nm":[4,4,40]{more}}}"#);
             fs::write(folder.path().join(AcquisitionInfo::FILE), text).unwrap();
             AcquisitionInfo::read(folder.path())
         };
@@ -445,9 +448,16 @@ mod tests {
         let text = r#"{"name":"cortex","extents":[10,20,3],"voxel_nm":[4,4,40]}"#;
         fs::write(folder.path().join(AcquisitionInfo::FILE), text).unwrap();
         let refused = AcquisitionInfo::read(folder.path()).unwrap_err();
-        assert!(matches!(refused, AcquisitionError::Key { meant: "extent", .. }));
+        assert!(matches!(
+            refused,
+            AcquisitionError::Key {
+                meant: "extent",
+                ..
+            }
+        ));
         // What a microscope says besides is its own.
-        let own = r#","kV":1.5,"date":"May","operator":{"kinds":1},"stage":[1],"sample":"x","size":3"#;
+        let own =
+            r#","kV":1.5,"date":"May","operator":{"kinds":1},"stage":[1],"sample":"x","size":3"#;
         assert!(read(own).is_ok());
         // Twice is not once.
         let twice = read(r#","dtype":"uint8","dtype":"uint16""#).unwrap_err();
@@ -469,7 +479,10 @@ mod tests {
             let refused = AcquisitionInfo::read(folder.path()).unwrap_err();
             assert!(matches!(refused, AcquisitionError::Channels { .. }));
             let told = refused.to_string();
-            assert!(told.contains(part) && told.contains("volume.json"), "{told}");
+            assert!(
+                told.contains(part) && told.contains("volume.json"),
+                "{told}"
+            );
         }
     }
 
@@ -486,10 +499,16 @@ mod tests {
             symlink(elsewhere.join(file), archive.join(file)).unwrap();
         }
         let refused = AcquisitionInfo::read(&archive).unwrap_err();
-        assert!(matches!(refused, AcquisitionError::LeadsOut { .. }), "{refused}");
+        assert!(
+            matches!(refused, AcquisitionError::LeadsOut { .. }),
+            "{refused}"
+        );
         let mut reader = RecordReader::new(&archive, Cursor::default());
         let refused = reader.read(1).unwrap_err();
-        assert!(matches!(refused, AcquisitionError::LeadsOut { .. }), "{refused}");
+        assert!(
+            matches!(refused, AcquisitionError::LeadsOut { .. }),
+            "{refused}"
+        );
         // The folder itself may be a link, and links within it are its own.
         let link = folder.path().join("link");
         symlink(&elsewhere, &link).unwrap();

@@ -221,6 +221,17 @@ pub enum ImageError {
         /// What was expected \[pixels\].
         want: UVec2,
     },
+    /// More pixels than any tile may have, or none.
+    #[error(
+        "the image says that it has {width} x {height} pixels, but tiles have 1 to {MAX_EDGE} along each edge, and \
+         at most {MAX_PIXELS}; cut it into smaller tiles"
+    )]
+    TooLarge {
+        /// Pixels along x.
+        width: u32,
+        /// Pixels along y.
+        height: u32,
+    },
     /// A file that no image of its size needs.
     #[error(
         "the file has {bytes} bytes, more than {most} that an image of its size can need; write it \
@@ -386,7 +397,18 @@ fn check_size(width: u32, height: u32) -> Result<usize, ImageError> {
     let pixels = u64::from(width) * u64::from(height);
     let possible = edges.contains(&width) && edges.contains(&height) && pixels <= MAX_PIXELS;
     let pixels = usize::try_from(pixels).ok().filter(|_| possible);
-    pixels.ok_or_else(|| sniff::broken(format!("its size is {width} x {height} pixels")))
+    pixels.ok_or(ImageError::TooLarge { width, height })
+}
+
+/// Refuses sizes that so few bytes cannot hold, before memory is set aside for them. `most`: what a byte can hold.
+fn check_ratio(kind: &str, stored: usize, samples: usize, most: usize) -> Result<(), ImageError> {
+    if samples / most > stored {
+        return Err(sniff::broken(format!(
+            "{stored} bytes cannot hold the {samples} values that it says it has: {kind} packs at most {most} \
+             into one"
+        )));
+    }
+    Ok(())
 }
 
 /// Zeros, or an error where memory does not suffice.

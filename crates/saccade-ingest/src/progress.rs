@@ -27,6 +27,10 @@ pub trait Progress: Send + Sync {
 
     /// Something a person should know: a file in quarantine, a full disk.
     fn notice(&self, text: &str);
+
+    /// Why the work does not go on, for as long as it does not: told again with each failure, and `None` once it
+    /// goes on.
+    fn held_up(&self, _why: Option<&str>) {}
 }
 
 /// Tells nobody.

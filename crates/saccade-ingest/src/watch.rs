@@ -149,6 +149,9 @@ struct Unread {
     since: SystemTime,
 }
 
+/// The section of a tile whose number is before the first one, which is set aside with that reason.
+pub(crate) const BEFORE_FIRST: u32 = u32::MAX;
+
 /// Name of the link to the watched folder.
 const LINK: &str = "files";
 
@@ -201,7 +204,11 @@ impl<F: Folders> Watch<F> {
             config.info.write(kept)?;
         }
         if linked.as_ref() != Some(&folder) {
-            let old = if linked.is_some() { fs::remove_file(&link) } else { Ok(()) };
+            let old = if linked.is_some() {
+                fs::remove_file(&link)
+            } else {
+                Ok(())
+            };
             old.and_then(|()| std::os::unix::fs::symlink(&folder, &link))
                 .map_err(|source| WatchError::Write { source, path: link })?;
         }
@@ -266,7 +273,10 @@ impl<F: Folders> Watch<F> {
     /// fits the pattern.
     pub fn unmatched(&self) -> Option<String> {
         let counts = self.scanner.counts();
-        let (path, folder) = counts.other.as_ref().filter(|_| self.seen && counts.fit == 0)?;
+        let (path, folder) = counts
+            .other
+            .as_ref()
+            .filter(|_| self.seen && counts.fit == 0)?;
         let pattern = &self.config.pattern;
         let why = pattern.mismatch(path, *folder).unwrap_or_default();
         let Counts { files, folders, .. } = counts;
@@ -374,8 +384,7 @@ impl<F: Folders> Watch<F> {
         TileRecord {
             tile: found.place.name(),
             file: format!("{LINK}/{}", found.file),
-            // A number before the first lies outside, and is set aside with that reason.
-            section: section.checked_sub(first).unwrap_or(u32::MAX),
+            section: section.checked_sub(first).unwrap_or(BEFORE_FIRST),
             size,
             transform,
             channel: channel.clone().map(ChannelRef::Name),
@@ -393,13 +402,16 @@ pub fn run<F: Folders>(
     once: bool,
     cancel: &Cancel,
 ) -> Result<u64, WatchError> {
+    /// Looks at a disk that stays full, after which it is said again.
+    const SAY_AGAIN: u32 = 40;
     let mut told = 0;
     let mut failures = 0;
+    let mut full: u32 = 0;
     let mut warned = false;
     while !cancel.is_cancelled() {
         match watch.look() {
             Ok((new, next)) => {
-                failures = 0;
+                (failures, full) = (0, 0);
                 told += new;
                 // Who looks once is told by the caller.
                 if let Some(why) = watch.unmatched().filter(|_| !once && !warned) {
@@ -419,7 +431,12 @@ pub fn run<F: Folders>(
                     path.display()
                 );
             }
-            Err(e) if e.is_full() => log::warn!("{e}; trying again"),
+            Err(e) if e.is_full() => {
+                if full % SAY_AGAIN == 0 {
+                    log::warn!("{e}; trying again");
+                }
+                full += 1;
+            }
             Err(e) => return Err(e),
         }
         let mut left = watch.config.poll;

@@ -58,7 +58,7 @@ fn main() -> ExitCode {
         match command {
             Command::Demo(demo) => done(demo.run().await),
             Command::Simulate(simulate) => done(simulate.run().await),
-            Command::Ingest(ingest) => done(ingest.run().await),
+            Command::Ingest(ingest) => ingest.run().await,
             Command::Serve(serve) => done(serve.run().await),
             Command::View(view) => done(view.run().await),
             Command::Render(render) => done(render.run().await),

@@ -31,6 +31,8 @@ struct SoFar {
     before: State,
     /// What was told last, with what was before.
     state: Option<State>,
+    /// Why it does not go on.
+    held_up: Option<String>,
     lines: Lines,
 }
 
@@ -72,6 +74,7 @@ impl Shown {
             total,
             before: State::default(),
             state: None,
+            held_up: None,
             lines: Lines::default(),
         });
         let inner = Arc::new(Inner { label, bar, so_far });
@@ -96,7 +99,7 @@ impl Shown {
         }
         let mut so_far = self.0.so_far();
         if let Some(state) = so_far.state.take() {
-            self.0.line(&state, so_far.total);
+            self.0.line(&state, &so_far);
         }
     }
 }
@@ -123,14 +126,16 @@ impl Inner {
         let (Some(state), None) = (so_far.state, &self.bar) else {
             return;
         };
-        let busy = state.tiles + state.quarantined < known(&state, so_far.total);
+        let busy = so_far.held_up.is_some()
+            || state.tiles + state.quarantined < known(&state, so_far.total);
         if so_far.lines.due(now(), &state, busy) {
-            self.line(&state, so_far.total);
+            self.line(&state, &so_far);
         }
     }
 
-    fn line(&self, state: &State, total: Option<u64>) {
-        say(&line(self.label, state, total));
+    fn line(&self, state: &State, so_far: &SoFar) {
+        let why = so_far.held_up.as_deref();
+        say(&line(self.label, state, so_far.total, why));
     }
 }
 
@@ -147,9 +152,21 @@ impl Progress for Shown {
         if let Some(bar) = &self.0.bar {
             bar.set_length(known(&state, so_far.total));
             bar.set_position(state.tiles);
-            bar.set_message(facts(&state));
+            bar.set_message(facts(&state, so_far.held_up.as_deref()));
         }
         so_far.state = Some(state);
+        drop(so_far);
+        self.0.look();
+    }
+
+    fn held_up(&self, why: Option<&str>) {
+        let mut so_far = self.0.so_far();
+        so_far.held_up = why.map(str::to_owned);
+        // Nothing is told while nothing is done.
+        let state = *so_far.state.get_or_insert_default();
+        if let Some(bar) = &self.0.bar {
+            bar.set_message(facts(&state, why));
+        }
         drop(so_far);
         self.0.look();
     }
@@ -168,18 +185,24 @@ fn known(state: &State, total: Option<u64>) -> u64 {
     total.unwrap_or(0).max(seen)
 }
 
-fn line(label: &str, state: &State, total: Option<u64>) -> String {
+fn line(label: &str, state: &State, total: Option<u64>, held_up: Option<&str>) -> String {
     let (tiles, known) = (state.tiles, known(state, total));
-    format!("{label}: {tiles} of {known} tiles, {}", facts(state))
+    format!(
+        "{label}: {tiles} of {known} tiles, {}",
+        facts(state, held_up)
+    )
 }
 
-fn facts(state: &State) -> String {
+fn facts(state: &State, held_up: Option<&str>) -> String {
     let mut facts = format!("{:.1} Mpixel/s, queue {}", state.mpixel_per_s, state.queued);
     if state.waiting > 0 {
         facts.push_str(&format!(", {} unfinished", state.waiting));
     }
     if state.quarantined > 0 {
         facts.push_str(&format!(", {} set aside", state.quarantined));
+    }
+    if let Some(why) = held_up {
+        facts.push_str(&format!("; waits: {why}"));
     }
     facts
 }
@@ -226,9 +249,11 @@ mod tests {
 
     #[test]
     fn lines_name_the_total() {
-        let said = line("demo", &state(12, 5), Some(340));
+        let said = line("demo", &state(12, 5), Some(340), None);
         assert_eq!(said, "demo: 12 of 340 tiles, 2.5 Mpixel/s, queue 5");
-        let said = line("ingest", &state(12, 5), None);
+        let said = line("ingest", &state(12, 5), None, None);
         assert!(said.starts_with("ingest: 12 of 17 tiles"), "{said}");
+        let said = line("ingest", &state(12, 5), None, Some("no space is left"));
+        assert!(said.ends_with("queue 5; waits: no space is left"), "{said}");
     }
 }

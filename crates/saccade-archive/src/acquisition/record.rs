@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use glam::UVec2;
 use saccade_core::transform::SectionFromTile;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::{AcquisitionError, refuse_link_out};
 
@@ -102,12 +103,43 @@ pub struct Cursor {
 
 /// A line that is no record.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("line {line} is no record: {reason}")]
+#[error("line {line} of {} is no record: {reason}", RecordReader::FILE)]
 pub struct BrokenRecord {
     /// Line, from 1.
     pub line: u64,
+    /// The image that it names, as far as it can be told.
+    pub file: Option<String>,
+    /// The tile that it names, as far as it can be told.
+    pub tile: Option<String>,
     /// What is wrong with it.
     pub reason: String,
+}
+
+impl BrokenRecord {
+    fn of(text: &[u8], line: u64, reason: String) -> Self {
+        /// Of whatever else it says.
+        #[derive(Deserialize)]
+        struct Named {
+            #[serde(default)]
+            file: Value,
+            #[serde(default)]
+            tile: Value,
+        }
+        let (file, tile) = match serde_json::from_slice(text) {
+            Ok(Named { file, tile }) => (file, tile),
+            Err(_) => (Value::Null, Value::Null),
+        };
+        let name = |value: Value| match value {
+            Value::String(name) if !name.trim().is_empty() => Some(name),
+            _ => None,
+        };
+        Self {
+            line,
+            file: name(file),
+            tile: name(tile),
+            reason,
+        }
+    }
 }
 
 /// A line as it was read.
@@ -253,7 +285,7 @@ impl RecordReader {
                 serde_json::from_slice(&text).map_err(|e| e.to_string())
             };
             let line = self.cursor.line;
-            let record = record.map_err(|reason| BrokenRecord { line, reason });
+            let record = record.map_err(|reason| BrokenRecord::of(&text, line, reason));
             lines.push(RecordLine {
                 offset,
                 next: self.cursor,
@@ -508,6 +540,14 @@ mod tests {
             .map(|l| l.record.as_ref().map_err(|b| b.line).err())
             .collect();
         assert_eq!(said, [None, Some(3), Some(4), Some(5), Some(6), None]);
+        // What can be told of what it is about, is.
+        let about = |n: usize| {
+            let broken = lines[n].record.as_ref().unwrap_err();
+            (broken.file.as_deref(), broken.tile.as_deref())
+        };
+        assert_eq!(about(1), (None, None));
+        assert_eq!(about(2), (Some("tiles/a.tif"), Some("a")));
+        assert_eq!(about(3), (None, None));
         let reason = |n: usize| lines[n].record.as_ref().unwrap_err().reason.clone();
         assert!(reason(2).contains("inverted"), "{}", reason(2));
         assert!(reason(4).contains("bytes"), "{}", reason(4));

@@ -3,7 +3,7 @@
 use turbojpeg::{Colorspace, Decompressor, Image, PixelFormat};
 
 use super::sniff::{broken, check_jpeg};
-use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, gray};
+use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, check_ratio, gray};
 
 /// Progressive files may refine the image as often as they like; this many times are enough.
 const MAX_SCANS: u32 = 500;
@@ -36,12 +36,7 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Decoded, ImageError
     /// A block of 64 pixels takes two bits at least; runs of empty ones take less in refining
     /// scans, but the first still names each row of blocks.
     const MAX_RATIO: usize = 1 << 15;
-    if pixels / MAX_RATIO > bytes.len() {
-        return Err(broken(format!(
-            "{} bytes cannot hold {pixels} pixels",
-            bytes.len()
-        )));
-    }
+    check_ratio("JPEG", bytes.len(), pixels, MAX_RATIO)?;
     let (format, channels) = match header.colorspace {
         Colorspace::Gray => (PixelFormat::GRAY, 1),
         Colorspace::YCbCr | Colorspace::RGB => (PixelFormat::RGB, 3),

@@ -6,7 +6,7 @@ use png::{BitDepth, ColorType, Decoder, DecodingError, Transformations};
 
 use super::sniff::{broken, check_png, incomplete};
 use super::tiff::unpack;
-use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, gray};
+use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, check_ratio, gray};
 
 pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     check_png(bytes)?;
@@ -40,11 +40,9 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> 
     // Rows begin on whole bytes.
     let row = (width as usize * channels * bits).div_ceil(8);
     let len = row * height as usize;
-    if reader.output_buffer_size() != Some(len) || len / MAX_RATIO > bytes.len() {
-        return Err(broken(format!(
-            "{} bytes cannot hold {pixels} pixels",
-            bytes.len()
-        )));
+    check_ratio("PNG", bytes.len(), len, MAX_RATIO)?;
+    if reader.output_buffer_size() != Some(len) {
+        return Err(broken(format!("its rows do not make {pixels} pixels")));
     }
     if depth == BitDepth::Sixteen {
         let mut samples = allocate::<u16>(pixels * channels)?;

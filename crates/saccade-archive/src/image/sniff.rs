@@ -66,7 +66,10 @@ fn other_kind(bytes: &[u8]) -> &'static str {
         (b"SIMPLE  ", "a FITS file"),
         (b"PK\x03\x04", "a ZIP archive"),
         (b"\x1f\x8b", "a file packed with gzip"),
-        (b"\xd0\xcf\x11\xe0", "a microscope's or an office's compound file"),
+        (
+            b"\xd0\xcf\x11\xe0",
+            "a microscope's or an office's compound file",
+        ),
         (b"ZISRAW", "a CZI"),
         (b"%PDF", "a PDF"),
         (b"8BPS", "a Photoshop file"),
@@ -75,7 +78,10 @@ fn other_kind(bytes: &[u8]) -> &'static str {
         return kind;
     }
     let begin = &bytes[..bytes.len().min(16)];
-    if begin.iter().all(|&b| b.is_ascii_graphic() || b.is_ascii_whitespace()) {
+    if begin
+        .iter()
+        .all(|&b| b.is_ascii_graphic() || b.is_ascii_whitespace())
+    {
         "text"
     } else {
         "of no format that is known here"
@@ -185,7 +191,10 @@ mod tests {
         ] {
             let told = kind(bytes).unwrap_err().to_string();
             assert!(told.contains(what), "{told}");
-            let inside = [String::from_utf8_lossy(&bytes[..4]).into_owned(), format!("{:02x?}", &bytes[..2])];
+            let inside = [
+                String::from_utf8_lossy(&bytes[..4]).into_owned(),
+                format!("{:02x?}", &bytes[..2]),
+            ];
             assert!(
                 what == "a GIF" || !inside.iter().any(|inside| told.contains(inside)),
                 "{told}"

@@ -200,12 +200,7 @@ fn check_ratio(stored: usize, pixels: usize) -> Result<(), ImageError> {
     /// LZW packs a little more than 1:1300, deflate 1:1032; blank tiles that share one stream
     /// take 8 bytes of offset and count for 1:2048 pixels.
     const MAX_RATIO: usize = 2048;
-    if pixels / MAX_RATIO > stored {
-        return Err(broken(format!(
-            "{stored} bytes cannot hold {pixels} pixels"
-        )));
-    }
-    Ok(())
+    super::check_ratio("TIFF", stored, pixels, MAX_RATIO)
 }
 
 fn sort(e: TiffError) -> ImageError {

@@ -18,6 +18,14 @@ pub enum StorageError {
         /// File or object.
         path: String,
     },
+    /// A folder has the name that the file is to have.
+    #[error(
+        "a folder lies where a file is to be written, and is left as it is; take it away: {path}"
+    )]
+    Occupied {
+        /// The folder.
+        path: String,
+    },
     /// The system forbids it.
     #[error(
         "access is denied; check the owner and permissions, and that the disk is not mounted read-only: {path}"
@@ -91,6 +99,7 @@ impl StorageError {
             io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
                 Self::Denied { source, path }
             }
+            io::ErrorKind::IsADirectory => Self::Occupied { path },
             _ => Self::Io { source, path },
         }
     }

@@ -335,6 +335,22 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_folder_in_the_place_of_a_file_is_said_to_be_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let storage = LocalStorage::new(dir.path()).unwrap();
+        fs::create_dir_all(dir.path().join("tiles/a.tif/inside")).unwrap();
+        let write = storage.write_durable("tiles/a.tif", Bytes::from_static(b"x"));
+        let refused = write.await.unwrap_err();
+        assert!(
+            matches!(refused, StorageError::Occupied { .. }),
+            "{refused}"
+        );
+        assert!(!refused.is_transient());
+        assert!(refused.to_string().contains("tiles/a.tif"), "{refused}");
+        assert_eq!(fs::read_dir(dir.path().join(INCOMING)).unwrap().count(), 0);
+    }
+
+    #[tokio::test]
     async fn conforms_on_a_simulated_disk() {
         let storage = LocalStorage::on(Arc::new(SimulatedDisk::new()), "deep/root").unwrap();
         super::super::conformance::check(Arc::new(storage)).await;

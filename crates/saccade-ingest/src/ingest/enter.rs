@@ -181,18 +181,21 @@ where
     F: Future<Output = Result<T, CatalogError>>,
 {
     let mut backoff = Backoff::new(options.retry);
+    let mut over = "";
     loop {
         match transaction().await {
             Ok(value) => {
-                if backoff.failures > 0 {
-                    progress.notice("the catalog can be used again");
-                }
+                backoff.over(progress, over);
                 return Ok(value);
             }
             Err(e) => {
                 if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
                     return Err(e);
                 }
+                over = match &e {
+                    CatalogError::Full { .. } => "there is space for the catalog again",
+                    _ => "the catalog can be used again",
+                };
                 backoff.say_and_wait(progress, &e).await;
             }
         }

@@ -7,16 +7,19 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
-use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord, image_path, is_inside};
+use saccade_archive::acquisition::{
+    DeleteRecord, TileRecord, TransformRecord, image_path, is_inside,
+};
 use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
-use saccade_archive::storage::Storage;
+use saccade_archive::storage::{Storage, StorageError};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::IngestError;
 use crate::progress::Progress;
+use crate::watch::BEFORE_FIRST;
 
 /// What a file looks like from outside; another look means that someone writes to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -188,6 +191,11 @@ impl Context<'_> {
             );
             return Ok(quarantine(&record, reason, bytes, None));
         }
+        if section == BEFORE_FIRST {
+            let reason = "the number of its section is less than that of the first one; give the smallest with \
+                          --first";
+            return Ok(quarantine(&record, reason.to_owned(), bytes, None));
+        }
         if place(self.extent, section, size, transform).is_none() {
             let reason = format!(
                 "the tile lies wholly outside the volume of {} voxels (section {section}, transform \
@@ -238,7 +246,11 @@ impl Context<'_> {
             Ok(pyramid) => pyramid,
             Err(e) => return Ok(quarantine(&record, e.to_string(), bytes, Some(name))),
         };
-        self.write(&record.tile, &name, pyramid).await?;
+        if let Err(occupied) = self.write(&record.tile, &name, pyramid).await? {
+            let reason =
+                format!("its pyramid cannot be written: {occupied}; then append the record again");
+            return Ok(quarantine(&record, reason, bytes, None));
+        }
         let pixels = u64::from(size.x) * u64::from(size.y);
         let tile = NewTile {
             name: record.tile,
@@ -252,17 +264,22 @@ impl Context<'_> {
         Ok(Outcome::Tile { tile, pixels })
     }
 
-    /// Writes a pyramid; waits as long as the disk is full or the object store away.
-    async fn write(&self, tile: &str, name: &str, pyramid: Bytes) -> Result<(), IngestError> {
+    /// Writes a pyramid; waits as long as the disk is full or the object store away. Where something else has its
+    /// name, and always will, that is told.
+    async fn write(
+        &self,
+        tile: &str,
+        name: &str,
+        pyramid: Bytes,
+    ) -> Result<Result<(), StorageError>, IngestError> {
         let mut backoff = Backoff::new(self.retry);
         loop {
             match self.storage.write_durable(name, pyramid.clone()).await {
                 Ok(()) => {
-                    if backoff.failures > 0 {
-                        self.progress.notice(&format!("tile {tile} is written now"));
-                    }
-                    return Ok(());
+                    backoff.over(self.progress, &format!("tile {tile} is written now"));
+                    return Ok(Ok(()));
                 }
+                Err(occupied @ StorageError::Occupied { .. }) => return Ok(Err(occupied)),
                 Err(e) => {
                     if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
                         return Err(IngestError::Storage {
@@ -379,14 +396,24 @@ impl Backoff {
         outage || (transient && self.failures < Self::ATTEMPTS)
     }
 
+    /// It worked: if it did not at first, `notice` says so.
+    pub(super) fn over(&self, progress: &dyn Progress, notice: &str) {
+        if self.failures > 0 {
+            progress.held_up(None);
+            progress.notice(notice);
+        }
+    }
+
     pub(super) async fn say_and_wait(
         &mut self,
         progress: &dyn Progress,
         error: &(dyn std::error::Error + Send + Sync + 'static),
     ) {
+        let why = with_sources(error);
         if self.failures == 1 {
-            progress.notice(&format!("{}; trying again", with_sources(error)));
+            progress.notice(&format!("{why}; trying again"));
         }
+        progress.held_up(Some(&why));
         tokio::time::sleep(self.next_pause()).await;
     }
 

@@ -217,6 +217,9 @@ impl Ingest<'_> {
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
             let due = self.room.due(self.context.folder, self.options.batch);
+            for notice in self.room.to_tell() {
+                self.context.progress.notice(&notice);
+            }
             let due: VecDeque<_> = due.into_iter().map(Job::from).collect();
             let worked = self.work(due).await?;
             self.delete_retired().await?;
@@ -476,7 +479,10 @@ async fn patiently<T>(
     let mut backoff = Backoff::new(options.retry);
     loop {
         match ask() {
-            Ok(answer) => return Ok(answer),
+            Ok(answer) => {
+                backoff.over(progress, "the records can be read again");
+                return Ok(answer);
+            }
             Err(e) => {
                 // Who waits for the end is told, rather than kept.
                 let patient = !options.once || backoff.failures < ATTEMPTS_ONCE;
@@ -548,9 +554,13 @@ impl From<RecordLine> for New {
             Ok(Record::Transform(record)) => Self::Done(Outcome::Transform { record, position }),
             Ok(Record::Delete(record)) => Self::Done(Outcome::Delete { record, position }),
             Err(broken) => {
+                // By the image, if the line names one: that is what people look for.
                 let what = Quarantined {
-                    file: RecordReader::FILE.to_owned(),
-                    tile: None,
+                    file: broken
+                        .file
+                        .clone()
+                        .unwrap_or_else(|| RecordReader::FILE.to_owned()),
+                    tile: broken.tile.clone(),
                     reason: format!("{broken}; append the record again as it should be"),
                     bytes: Some(line.next.offset - line.offset),
                     at: SystemTime::now(),

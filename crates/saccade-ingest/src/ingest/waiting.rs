@@ -31,6 +31,8 @@ struct Guest {
     since: u64,
     pause: u64,
     next: u64,
+    /// Whether people know that it waits.
+    told: bool,
 }
 
 /// What to do for a record that waits.
@@ -54,6 +56,7 @@ impl WaitingRoom {
                 since: 0,
                 pause: 1,
                 next: 0,
+                told: false,
             };
             (guest.waiting.position, guest)
         });
@@ -81,8 +84,39 @@ impl WaitingRoom {
             since: poll,
             pause: 1,
             next: poll + 1,
+            told: self.records.get(&position).is_some_and(|guest| guest.told),
         };
         self.records.insert(position, guest);
+    }
+
+    /// What to say of files that do not change, each once, and of many at once the first ones.
+    pub(super) fn to_tell(&mut self) -> Vec<String> {
+        const AT_ONCE: usize = 3;
+        // Most are whole a moment after their record.
+        let patience = (self.patience / 15).max(2);
+        let poll = self.poll;
+        let mut told = Vec::new();
+        let mut more = 0;
+        for guest in self.records.values_mut() {
+            let waits = guest.kind == WaitKind::Incomplete && poll - guest.since >= patience;
+            if guest.told || !waits {
+                continue;
+            }
+            guest.told = true;
+            if told.len() == AT_ONCE {
+                more += 1;
+                continue;
+            }
+            let Waiting { record, reason, .. } = &guest.waiting;
+            told.push(format!(
+                "{} (tile {}) is waited for: {reason}",
+                record.file, record.tile
+            ));
+        }
+        if more > 0 {
+            told.push(format!("{more} more files are waited for"));
+        }
+        told
     }
 
     /// A record is done with, whatever became of it.
@@ -209,6 +243,32 @@ mod tests {
             }
         }
         assert!(retries >= 20, "only {retries} attempts");
+    }
+
+    #[test]
+    fn who_waits_is_told_once_and_not_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut room = room(120);
+        for n in 0..5 {
+            room.admit(waiting(n, &format!("{n}.tif")), None, WaitKind::Incomplete);
+        }
+        room.admit(waiting(9, "broken.tif"), None, WaitKind::Broken);
+        let mut told = Vec::new();
+        for poll in 1..=40 {
+            assert!(room.due(folder.path(), 0).is_empty());
+            let now = room.to_tell();
+            assert!(now.is_empty() || poll == 8, "poll {poll}: {now:?}");
+            told.extend(now);
+        }
+        assert_eq!(told.len(), 4, "{told:?}");
+        assert_eq!(told[1], "1.tif (tile 1.tif) is waited for: it ends early");
+        assert_eq!(told[3], "2 more files are waited for");
+        // Not again when it was tried again in vain.
+        room.admit(waiting(1, "1.tif"), None, WaitKind::Incomplete);
+        for _ in 0..40 {
+            room.due(folder.path(), 0);
+            assert!(room.to_tell().is_empty());
+        }
     }
 
     #[test]

@@ -160,7 +160,10 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
             Ok(listed) => listed,
             Err(error) if lists::is_meant(list, &images) => {
                 // Text is surely a list; of JSON, another file may be the one that is meant.
-                if list.extension().is_some_and(|e| e.eq_ignore_ascii_case("txt")) {
+                if list
+                    .extension()
+                    .is_some_and(|e| e.eq_ignore_ascii_case("txt"))
+                {
                     return Err(error.into());
                 }
                 unreadable.get_or_insert(error);

@@ -120,9 +120,7 @@ pub(super) fn is_meant(path: &Path, images: &Images) -> bool {
         .is_some_and(|e| e.eq_ignore_ascii_case("json"))
     {
         let has = |word| text.contains(word);
-        return text.trim_start().starts_with('[')
-            && has("\"tileId\"")
-            && has("\"mipmapLevels\"");
+        return text.trim_start().starts_with('[') && has("\"tileId\"") && has("\"mipmapLevels\"");
     }
     let is_there = |file: &str| !file.is_empty() && images.find(file).is_some();
     let listed = |line: &str| {

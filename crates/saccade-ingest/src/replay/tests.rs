@@ -354,16 +354,44 @@ fn a_list_that_makes_no_sense_is_no_stack() {
     let specs = format!("[{}, {}]", spec("a", "30"), spec("b", "-30"));
     let broken: [(&str, String, &str); 12] = [
         ("list.txt", plain.replace("25", "x"), "line 2: x is \"x\""),
-        ("list.txt", plain.replace("25", "nan"), "line 2: x is \"nan\""),
-        ("list.txt", plain.replace("a.tif 0 0 0", "a.tif 0 0"), "line 1: "),
-        ("list.txt", plain.replace("0\nb", "0.5\nb"), "line 1: z is \"0.5\""),
+        (
+            "list.txt",
+            plain.replace("25", "nan"),
+            "line 2: x is \"nan\"",
+        ),
+        (
+            "list.txt",
+            plain.replace("a.tif 0 0 0", "a.tif 0 0"),
+            "line 1: ",
+        ),
+        (
+            "list.txt",
+            plain.replace("0\nb", "0.5\nb"),
+            "line 1: z is \"0.5\"",
+        ),
         ("list.txt", format!("# stage\n{plain}the end\n"), "line 4: "),
-        ("list.txt", "a.tif nan 0 0\n".to_owned(), "line 1: x is \"nan\""),
-        ("TileConfiguration.txt", fiji.replace("25", "nan"), "line 3: "),
+        (
+            "list.txt",
+            "a.tif nan 0 0\n".to_owned(),
+            "line 1: x is \"nan\"",
+        ),
+        (
+            "TileConfiguration.txt",
+            fiji.replace("25", "nan"),
+            "line 3: ",
+        ),
         ("tiles.txt", fiji.replace("(25", "(2 5"), "line 3: "),
-        ("TileConfiguration.txt", fiji.replace("dim = 2\n", ""), "line 1: "),
+        (
+            "TileConfiguration.txt",
+            fiji.replace("dim = 2\n", ""),
+            "line 1: ",
+        ),
         ("TileConfiguration.txt", String::new(), "line 1: "),
-        ("TileConfiguration.registered.txt", fiji.replace("25", "nan"), "line 3: "),
+        (
+            "TileConfiguration.registered.txt",
+            fiji.replace("25", "nan"),
+            "line 3: ",
+        ),
         ("specs.json", specs, "tile \"b\": width is -30"),
     ];
     for (file, text, said) in broken {
@@ -413,8 +441,14 @@ fn a_project_without_its_list_is_no_stack() {
     fs::remove_file(folder.path().join("list.txt")).unwrap();
     let error = detect(folder.path()).unwrap_err();
     let told = error.to_string();
-    assert!(matches!(error, ReplayError::NoList { images: 4, .. }), "{error:?}");
-    assert!(told.contains("file x y z") && told.contains("a_same.xml"), "{told}");
+    assert!(
+        matches!(error, ReplayError::NoList { images: 4, .. }),
+        "{error:?}"
+    );
+    assert!(
+        told.contains("file x y z") && told.contains("a_same.xml"),
+        "{told}"
+    );
 
     // One that cannot be read is not passed over, with a list or without.
     let folder = acquisition();
@@ -427,7 +461,10 @@ fn a_project_without_its_list_is_no_stack() {
             panic!("{error:?}")
         };
         let told = source.to_string();
-        assert!(told.contains("nought") && told.contains("c_refined.xml"), "{told}");
+        assert!(
+            told.contains("nought") && told.contains("c_refined.xml"),
+            "{told}"
+        );
         fs::write(folder.path().join("list.txt"), "").unwrap();
         fs::remove_file(folder.path().join("a_same.xml")).unwrap_or_default();
         fs::remove_file(folder.path().join("b_part.xml")).unwrap_or_default();
@@ -435,7 +472,10 @@ fn a_project_without_its_list_is_no_stack() {
     // Other XML is no project.
     let folder = two_pictures();
     fs::write(folder.path().join("microscope.xml"), "<scope>").unwrap();
-    assert!(matches!(detect(folder.path()).unwrap(), Input::Stack { .. }));
+    assert!(matches!(
+        detect(folder.path()).unwrap(),
+        Input::Stack { .. }
+    ));
 }
 
 #[test]

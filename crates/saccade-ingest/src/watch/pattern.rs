@@ -117,7 +117,8 @@ impl Pattern {
         if folder {
             (deep >= want).then(|| "it is a folder where the pattern has files".to_owned())
         } else {
-            (deep != want).then(|| format!("it lies {deep} folders deep, the pattern's files {want}"))
+            (deep != want)
+                .then(|| format!("it lies {deep} folders deep, the pattern's files {want}"))
         }
     }
 }

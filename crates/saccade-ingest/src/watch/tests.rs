@@ -437,7 +437,10 @@ fn a_folder_is_watched_on_with_the_same_options_alone() {
     image(&scope.join("s3/r2_c1_b.tif"), 40, 9);
     looks(&mut Watch::open(config(), Disk, &scope, &kept).unwrap());
     let others: [Otherwise; 8] = [
-        (|c| c.pitch.y = 81.0, "pitch is 90.0 x 80.0 there, 90.0 x 81.0 now"),
+        (
+            |c| c.pitch.y = 81.0,
+            "pitch is 90.0 x 80.0 there, 90.0 x 81.0 now",
+        ),
         (|c| c.scale = 1.0, "pixel is 2.0 there, 1.0 now"),
         (|c| c.first = 0, "first is 1 there, 0 now"),
         (
@@ -445,9 +448,18 @@ fn a_folder_is_watched_on_with_the_same_options_alone() {
             "pattern is s{section}/r{row}_c{column}_{channel}.tif there, \
              s{section}/r{column}_c{row}_{channel}.tif now",
         ),
-        (|c| c.info.extent.x = 1, "extent is 500 x 500 x 9 there, 1 x 500 x 9 now"),
-        (|c| c.info.voxel_nm.z = 2.0, "voxel-nm is 1 x 1 x 1 there, 1 x 1 x 2 now"),
-        (|c| c.info.channels.reverse(), "channels is a,b there, b,a now"),
+        (
+            |c| c.info.extent.x = 1,
+            "extent is 500 x 500 x 9 there, 1 x 500 x 9 now",
+        ),
+        (
+            |c| c.info.voxel_nm.z = 2.0,
+            "voxel-nm is 1 x 1 x 1 there, 1 x 1 x 2 now",
+        ),
+        (
+            |c| c.info.channels.reverse(),
+            "channels is a,b there, b,a now",
+        ),
         (
             |c| c.info.dtype = saccade_core::volume::Dtype::Uint16,
             "voxel is 8 bits there, 16 bits now",
@@ -494,7 +506,10 @@ fn a_mistake_that_took_nothing_in_binds_nobody() {
     assert_eq!(told(&kept).len(), 1);
     assert_eq!(AcquisitionInfo::read(&kept).unwrap(), config().info);
     let file = told(&kept)[0].file.clone();
-    assert!(kept.join(file).is_file(), "the link leads to the right folder");
+    assert!(
+        kept.join(file).is_file(),
+        "the link leads to the right folder"
+    );
 }
 
 #[test]
@@ -502,13 +517,34 @@ fn a_pattern_that_fits_nothing_is_explained() {
     let deep = pattern("s{section}/r{row}_c{column}_{channel}.tif");
     let why = |path: &str| deep.mismatch(path, false).unwrap();
     for (path, said) in [
-        ("x1/r2_c3_a.tif", r#""x1" begins otherwise where "s" should be"#),
-        ("sx/r2_c3_a.tif", r#"after "s" comes "x" where a number for {section} should be"#),
-        ("s1x/r2_c3_a.tif", r#"after "s1" comes "x" where nothing more should be"#),
-        ("s1/r2-c3_a.tif", r#"after "r2" comes "-c3_a.tif" where "_c" should be"#),
-        ("s1/r2_c3_a.tiff", r#"after "r2_c3_a.tif" comes "f" where nothing more should be"#),
-        ("s1/r2_c3_a.png", r#"after "r2_c3_" comes "a.png" where ".tif" should be"#),
-        ("s1/r2_c3_.tif", r#"after "r2_c3_" comes ".tif" where a name for {channel} should be"#),
+        (
+            "x1/r2_c3_a.tif",
+            r#""x1" begins otherwise where "s" should be"#,
+        ),
+        (
+            "sx/r2_c3_a.tif",
+            r#"after "s" comes "x" where a number for {section} should be"#,
+        ),
+        (
+            "s1x/r2_c3_a.tif",
+            r#"after "s1" comes "x" where nothing more should be"#,
+        ),
+        (
+            "s1/r2-c3_a.tif",
+            r#"after "r2" comes "-c3_a.tif" where "_c" should be"#,
+        ),
+        (
+            "s1/r2_c3_a.tiff",
+            r#"after "r2_c3_a.tif" comes "f" where nothing more should be"#,
+        ),
+        (
+            "s1/r2_c3_a.png",
+            r#"after "r2_c3_" comes "a.png" where ".tif" should be"#,
+        ),
+        (
+            "s1/r2_c3_.tif",
+            r#"after "r2_c3_" comes ".tif" where a name for {channel} should be"#,
+        ),
         ("s1/r2_c3", r#""r2_c3" ends where "_" should be"#),
         ("s1", "it lies 0 folders deep, the pattern's files 1"),
     ] {
@@ -526,7 +562,10 @@ fn a_pattern_that_fits_nothing_is_explained() {
     fs::create_dir(scope.join("section 1")).unwrap();
     looks(&mut watch);
     let said = watch.unmatched().unwrap();
-    assert!(said.contains(r#"such as "section 1": after "s" comes"#), "{said}");
+    assert!(
+        said.contains(r#"such as "section 1": after "s" comes"#),
+        "{said}"
+    );
     fs::write(scope.join("s4/r1.tif"), "").unwrap();
     fs::write(scope.join("s4/.hidden"), "").unwrap();
     let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();

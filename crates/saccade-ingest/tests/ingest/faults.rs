@@ -1,10 +1,12 @@
 //! Disks that fill, fail and lie.
 
+use std::fs;
 use std::sync::Arc;
 use std::time::Duration;
 
 use glam::UVec2;
 use saccade_archive::VisualizationArchive;
+use saccade_archive::acquisition::RecordReader;
 use saccade_archive::catalog::Catalog;
 use saccade_archive::storage::{FaultyStorage, MemoryStorage, Storage, WriteFault};
 use saccade_ingest::Cancel;
@@ -79,8 +81,10 @@ async fn a_full_disk_is_waited_out() {
         while !diary.notices().iter().any(|n| n.contains("no space")) {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
-        // Many attempts later: nothing was given up.
+        // Many attempts later: nothing was given up, and the reason is still told.
         tokio::time::sleep(Duration::from_millis(200)).await;
+        let why = diary.held_up().expect("it waits");
+        assert!(why.contains("no space is left to write"), "{why}");
         let tiles = seen(&bench.archive).await.len();
         assert!(
             tiles < usize::from(TILES),
@@ -99,7 +103,37 @@ async fn a_full_disk_is_waited_out() {
     let both = async { tokio::join!(ingest, free) };
     let both = tokio::time::timeout(Duration::from_secs(60), both).await;
     assert_eq!(both.expect("it ends").0.unwrap().tiles, u64::from(TILES));
+    assert_eq!(diary.held_up(), None, "it goes on");
+    let notices = diary.notices();
+    assert!(
+        notices.iter().any(|n| n.contains("is written now"))
+            && !notices.iter().any(|n| n.contains("catalog")),
+        "the catalog had nothing to do with it: {notices:?}"
+    );
     bench.is_complete().await;
+}
+
+/// It would be there for ever: nobody but a person can take it away.
+#[tokio::test]
+async fn a_folder_in_the_place_of_a_pyramid_is_told_and_holds_nothing_up() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = crate::scope::archive(folder.path()).await;
+    let position = fs::metadata(scope.path().join(RecordReader::FILE)).map_or(0, |meta| meta.len());
+    let pyramid = format!("tiles/{VOLUME}/000000/a-{position:x}.tif");
+    let occupied = folder.path().join(&pyramid);
+    fs::create_dir_all(&occupied).unwrap();
+    scope.tile("a", 0, SIZE, 1);
+    scope.tile("b", 1, SIZE, 2);
+    let summary = scope.ingest(&archive).await;
+    assert_eq!((summary.tiles, summary.quarantined), (1, 1));
+    let set_aside = archive.catalog().quarantined(VOLUME).await.unwrap();
+    assert_eq!(set_aside[0].tile.as_deref(), Some("a"));
+    let reason = &set_aside[0].reason;
+    for part in ["a folder lies where", &pyramid, "append the record again"] {
+        assert!(reason.contains(part), "{part:?} is not in: {reason}");
+    }
+    assert!(occupied.is_dir());
+    assert_eq!(scope.ingest(&archive).await.quarantined, 0);
 }
 
 #[tokio::test]

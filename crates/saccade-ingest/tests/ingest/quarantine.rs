@@ -91,7 +91,8 @@ async fn a_link_out_of_the_archive() {
                     panic!("a tile")
                 };
                 if folder {
-                    std::os::unix::fs::symlink(elsewhere.path(), scope.path().join("deep")).unwrap();
+                    std::os::unix::fs::symlink(elsewhere.path(), scope.path().join("deep"))
+                        .unwrap();
                     record.file = "deep/secret".to_owned();
                 } else {
                     std::os::unix::fs::symlink(&secret, scope.file("link")).unwrap();
@@ -155,6 +156,64 @@ async fn a_file_that_stays_half() {
         &what,
         &["complete", "has not changed", "append its record again"],
     );
+}
+
+/// A record that makes no sense is told by its image, where it names one.
+#[tokio::test]
+async fn a_record_that_makes_no_sense() {
+    let what = refused(|scope| {
+        let line =
+            "{\"record\":\"tile\",\"tile\":\"odd\",\"file\":\"tiles/odd.tif\",\"section\":-1}\n";
+        let path = scope.path().join(RecordReader::FILE);
+        let text = fs::read_to_string(&path).unwrap() + line;
+        fs::write(path, text).unwrap();
+    })
+    .await;
+    assert_eq!(
+        (&*what.file, what.tile.as_deref()),
+        ("tiles/odd.tif", Some("odd"))
+    );
+    says(&what, &["line 2 of tiles.jsonl", "append the record again"]);
+}
+
+/// So small a file, and so many pixels: the reason says what is too much.
+#[tokio::test]
+async fn a_bomb() {
+    let header = |width: u32, height: u32| {
+        let mut file = b"\x89PNG\r\n\x1a\n".to_vec();
+        let mut chunk = |name: &[u8], body: &[u8]| {
+            file.extend(u32::try_from(body.len()).unwrap().to_be_bytes());
+            let named = [name, body].concat();
+            file.extend(&named);
+            file.extend(crc32fast::hash(&named).to_be_bytes());
+        };
+        let size = [width.to_be_bytes(), height.to_be_bytes()].concat();
+        chunk(b"IHDR", &[&size[..], &[8, 0, 0, 0, 0]].concat());
+        chunk(b"IDAT", &[0x78, 0x01, 0x03, 0x00, 0x00, 0x00, 0x00, 0x01]);
+        chunk(b"IEND", &[]);
+        file
+    };
+    for (size, words) in [
+        (
+            UVec2::splat(60_000),
+            &["3600000000 values", "PNG packs at most 2048"],
+        ),
+        (
+            UVec2::splat(90_000),
+            &["90000 x 90000 pixels", "at most 4294967296"],
+        ),
+        (
+            UVec2::new(600_000, 1),
+            &["600000 x 1 pixels", "1 to 524288"],
+        ),
+    ] {
+        let what = refused(|scope| {
+            fs::write(scope.file("bomb"), header(size.x, size.y)).unwrap();
+            scope.say(&tile_record("bomb", 0, size));
+        })
+        .await;
+        says(&what, words);
+    }
 }
 
 #[tokio::test]

@@ -244,11 +244,16 @@ pub(crate) async fn orphans(archive: &VisualizationArchive) -> BTreeSet<String> 
 pub(crate) struct Diary {
     notices: Mutex<Vec<String>>,
     states: Mutex<Vec<State>>,
+    held_up: Mutex<Option<String>>,
 }
 
 impl Diary {
     pub(crate) fn notices(&self) -> Vec<String> {
         self.notices.lock().unwrap().clone()
+    }
+
+    pub(crate) fn held_up(&self) -> Option<String> {
+        self.held_up.lock().unwrap().clone()
     }
 
     pub(crate) fn states(&self) -> Vec<State> {
@@ -259,6 +264,10 @@ impl Diary {
 impl Progress for Diary {
     fn update(&self, state: &State) {
         self.states.lock().unwrap().push(*state);
+    }
+
+    fn held_up(&self, why: Option<&str>) {
+        *self.held_up.lock().unwrap() = why.map(str::to_owned);
     }
 
     fn notice(&self, text: &str) {

@@ -1,11 +1,13 @@
 //! `saccade ingest`: from what a microscope writes to what can be looked at.
 
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
 use glam::{DVec2, DVec3, UVec3};
 use saccade_archive::acquisition::AcquisitionInfo;
+use saccade_archive::catalog::Catalog;
 use saccade_archive::pyramid::Encoding;
 use saccade_archive::{CatalogLocation, VisualizationArchive};
 use saccade_core::volume::{Dtype, check_name};
@@ -28,7 +30,7 @@ pub(crate) struct Ingest {
     #[command(flatten)]
     archive: Archive,
 
-    /// End once everything that is there is done, instead of following
+    /// End once everything that is there is done, instead of following; with 3 if anything was set aside
     #[arg(long)]
     once: bool,
 
@@ -164,8 +166,50 @@ fn named_after(folder: &Path) -> String {
     name.unwrap_or_else(|| "volume".to_owned())
 }
 
+/// What the command ends with when all was done once, but not all could be taken in.
+const SET_ASIDE: u8 = 3;
+
+/// The first of many, and how many more.
+fn first<T>(all: &[T], say: impl Fn(&T) -> String) -> String {
+    const SHOWN: usize = 3;
+    let mut words: Vec<_> = all.iter().take(SHOWN).map(say).collect();
+    if all.len() > SHOWN {
+        words.push(format!("and {} more", all.len() - SHOWN));
+    }
+    words.join("; ")
+}
+
+/// What was set aside by this run, and what still waits.
+async fn say_what_is_left(catalog: &Catalog, volume: &str, quarantined: u64) -> Result<()> {
+    if quarantined > 0 {
+        let all = catalog.quarantined(volume).await?;
+        let before = all.len().saturating_sub(usize::try_from(quarantined)?);
+        let named = first(&all[before..], |one| match &one.tile {
+            Some(tile) => format!("{} (tile {tile})", one.file),
+            None => one.file.clone(),
+        });
+        say(&format!(
+            "set aside, for reasons told above and by /v/{volume}/status.json of `saccade serve`: {named}"
+        ));
+    }
+    let waiting = catalog.waiting(volume).await?;
+    if !waiting.is_empty() {
+        let named = first(&waiting, |one| {
+            format!(
+                "{} (tile {}): {}",
+                one.record.file, one.record.tile, one.reason
+            )
+        });
+        let count = waiting.len();
+        say(&format!(
+            "{count} unfinished, taken up when it is started again: {named}"
+        ));
+    }
+    Ok(())
+}
+
 impl Ingest {
-    pub(crate) async fn run(self) -> Result<()> {
+    pub(crate) async fn run(self) -> Result<ExitCode> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
         let name = self
             .volume
@@ -183,7 +227,7 @@ impl Ingest {
         let opened = waited_for(|| VisualizationArchive::create(&location));
         let archive = tokio::select! {
             archive = opened => archive?,
-            () = cancel.cancelled() => return Ok(()),
+            () = cancel.cancelled() => return Ok(ExitCode::SUCCESS),
         };
         let mut options = IngestOptions {
             volume: self.volume,
@@ -234,7 +278,7 @@ impl Ingest {
                 done = taken_in => done,
                 failed = watching => {
                     failed??;
-                    return Ok(());
+                    return Ok(ExitCode::SUCCESS);
                 }
             },
         };
@@ -248,6 +292,17 @@ impl Ingest {
             early,
             ..
         } = done?;
+        let volume = match options.volume {
+            Some(name) => Some(name),
+            None => AcquisitionInfo::read(&acquisition)
+                .ok()
+                .map(|info| info.name),
+        };
+        if let Some(volume) = volume
+            && let Err(e) = say_what_is_left(archive.catalog(), &volume, quarantined).await
+        {
+            log::warn!("what is left cannot be told: {e}");
+        }
         archive.catalog().close().await;
         let mut done = format!("{tiles} tiles taken in, {moved} moved, {quarantined} set aside");
         if deleted > 0 {
@@ -257,7 +312,12 @@ impl Ingest {
             done.push_str(&format!(", {early} transforms of tiles that have not come"));
         }
         say(&format!("{done}: {location}"));
-        Ok(())
+        let all = !self.once || quarantined == 0;
+        Ok(if all {
+            ExitCode::SUCCESS
+        } else {
+            ExitCode::from(SET_ASIDE)
+        })
     }
 }
 

@@ -113,6 +113,67 @@ fn a_volume_of_another_size() {
     );
 }
 
+#[test]
+fn bare_folders_whose_names_or_options_do_not_fit() {
+    let folder = tempfile::tempdir().unwrap();
+    let scope = folder.path().join("scope");
+    sections(&scope);
+    let archive = folder.path().join("archive");
+    let ingest = |pattern: &str, pitch: &str, more: &[&str]| {
+        let words = [
+            "ingest",
+            text(&scope),
+            text(&archive),
+            "--once",
+            "--pattern",
+            pattern,
+        ];
+        let size = ["--extent", "70,60,3", "--voxel", "4,4,40", "--pitch", pitch];
+        run(words.iter().chain(&size).chain(more))
+    };
+    let unfit = ingest("s{section}_r{row}.png", "70,60", &[]);
+    assert_failed(
+        &unfit,
+        1,
+        &[
+            "no file fits the pattern s{section}_r{row}.png",
+            "3 files and 0 folders",
+            "comes \".png\" where \"_r\" should be",
+        ],
+    );
+    let twice = ingest("s{section}.png", "70,60", &["--channels", "SE,SE"]);
+    assert_failed(&twice, 1, &["two channels", "\"SE\"", "--channels"]);
+    // What took nothing in does not bind.
+    let fits = |pitch: &str| ingest("s{section}.png", pitch, &[]);
+    let done = fits("70,60");
+    assert!(done.status.success(), "{}", stderr(&done));
+    assert!(
+        stderr(&done).contains("3 tiles taken in"),
+        "{}",
+        stderr(&done)
+    );
+    assert_failed(
+        &fits("70,61"),
+        1,
+        &[
+            "pitch is 70.0 x 60.0 there, 70.0 x 61.0 now",
+            "same options",
+            "--volume NAME",
+        ],
+    );
+    // A stack has other ways in.
+    let plain = run(["ingest", text(&scope), text(&archive)]);
+    assert_failed(
+        &plain,
+        1,
+        &[
+            "--pattern",
+            "saccade simulate ACQUISITION --input FOLDER",
+            "saccade demo",
+        ],
+    );
+}
+
 /// Of the same name and size, but not the one that was taken in.
 #[test]
 fn a_second_acquisition_in_the_same_archive() {
@@ -600,7 +661,15 @@ fn bad_tiles_are_set_aside_and_told() {
     let archive = folder.path().join("archive");
     let output = run(["ingest", text(&acquisition), text(&archive), "--once"]);
     let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
+    assert_eq!(output.status.code(), Some(3), "{said}");
+    let left = said.lines().rev().nth(1).unwrap();
+    assert!(
+        left.starts_with("set aside, ")
+            && left.contains("status.json")
+            && left.contains("(tile ")
+            && left.ends_with("; and 1 more"),
+        "{said}"
+    );
     let summary = said.lines().last().unwrap();
     assert!(
         summary.contains("12 tiles taken in")
@@ -619,6 +688,9 @@ fn bad_tiles_are_set_aside_and_told() {
         assert!(said.contains(part), "{part:?} is not in: {said}");
     }
 
+    // What is done is done.
+    let again = run(["ingest", text(&acquisition), text(&archive), "--once"]);
+    assert!(again.status.success(), "{}", stderr(&again));
     let (_server, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
