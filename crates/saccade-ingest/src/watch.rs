@@ -432,7 +432,7 @@ pub fn run<F: Folders>(
                 );
             }
             Err(e) if e.is_full() => {
-                if full % SAY_AGAIN == 0 {
+                if full.is_multiple_of(SAY_AGAIN) {
                     log::warn!("{e}; trying again");
                 }
                 full += 1;

@@ -217,7 +217,7 @@ impl Ingest<'_> {
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
             let due = self.room.due(self.context.folder, self.options.batch);
-            for notice in self.room.to_tell() {
+            for notice in self.room.news() {
                 self.context.progress.notice(&notice);
             }
             let due: VecDeque<_> = due.into_iter().map(Job::from).collect();

@@ -90,7 +90,7 @@ impl WaitingRoom {
     }
 
     /// What to say of files that do not change, each once, and of many at once the first ones.
-    pub(super) fn to_tell(&mut self) -> Vec<String> {
+    pub(super) fn news(&mut self) -> Vec<String> {
         const AT_ONCE: usize = 3;
         // Most are whole a moment after their record.
         let patience = (self.patience / 15).max(2);
@@ -256,7 +256,7 @@ mod tests {
         let mut told = Vec::new();
         for poll in 1..=40 {
             assert!(room.due(folder.path(), 0).is_empty());
-            let now = room.to_tell();
+            let now = room.news();
             assert!(now.is_empty() || poll == 8, "poll {poll}: {now:?}");
             told.extend(now);
         }
@@ -267,7 +267,7 @@ mod tests {
         room.admit(waiting(1, "1.tif"), None, WaitKind::Incomplete);
         for _ in 0..40 {
             room.due(folder.path(), 0);
-            assert!(room.to_tell().is_empty());
+            assert!(room.news().is_empty());
         }
     }
 
