@@ -322,7 +322,8 @@ fn build(path: &Path, record: &TileRecord, stored: Stored) -> Result<Bytes, Refu
     }
     let image = image::decode_file_as(path, stored.wanted(record.size)).map_err(|e| match e {
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
-        ImageError::Broken { .. } => Refusal::Broken(e.to_string()),
+        // Of a file that is just being written, the head may be half there.
+        ImageError::Broken { .. } | ImageError::TooLarge { .. } => Refusal::Broken(e.to_string()),
         ImageError::Read { ref source, .. } => Refusal::Incomplete(format!("{e}: {source}")),
         _ => Refusal::Never(e.to_string()),
     })?;

@@ -20,7 +20,12 @@ const SIZE: UVec2 = UVec2::new(140, 130);
 fn acquired(prefix: &str, tiles: u32) -> Scope {
     let scope = Scope::new();
     for n in 0..tiles {
-        scope.tile(&format!("{prefix}{n}"), n, SIZE, 7 + n as u8);
+        scope.tile(
+            &format!("{prefix}{n}"),
+            n,
+            SIZE,
+            7 + u8::try_from(n).unwrap(),
+        );
     }
     scope
 }
