@@ -568,6 +568,7 @@ fn a_pattern_that_fits_nothing_is_explained() {
     );
     fs::write(scope.join("s4/r1.tif"), "").unwrap();
     fs::write(scope.join("s4/.hidden"), "").unwrap();
+    drop(watch);
     let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
     looks(&mut watch);
     let said = watch.unmatched().unwrap();
