@@ -113,6 +113,7 @@ impl StorageError {
             | Self::NotKept { path, .. }
             | Self::Refused { path, .. }
             | Self::Unavailable { path, .. }
+            | Self::Occupied { path }
             | Self::Io { path, .. } => text.replace(&format!(": {path}"), ""),
             Self::NotFound { .. } | Self::Name { .. } => text,
         }
