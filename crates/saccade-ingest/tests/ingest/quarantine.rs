@@ -236,7 +236,7 @@ async fn a_device_in_place_of_an_image() {
         scope.say(&tile_record("device", 0, SIZE));
     })
     .await;
-    says(&what, &["no regular file", "append the record again"]);
+    says(&what, &["leads out", "append the record again"]);
 }
 
 #[tokio::test]
