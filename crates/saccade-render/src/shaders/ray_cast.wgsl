@@ -340,6 +340,8 @@ fn trace(pixel: vec2u) -> vec3f {
 
     var light = vec3f(0.0);
     var transmitted = 1.0;
+    // What was transmitted when the last row of bricks began; so much that the first row is one brick.
+    var row_light = 1.0 / TERMINATION;
     var start = depths.x;
     var level = 0u;
     var level_end = -1.0;
@@ -441,8 +443,13 @@ fn trace(pixel: vec2u) -> vec3f {
                 var forgets = false;
                 if SLOTS == 1u {
                     // Several bricks in a row: rays that are drawn at once wait for each other at its end, and no
-                    // longer at the end of each brick. Surfaces end rays too soon for that.
-                    let most_bricks = select(3u, 1u, MODE == MODE_ISO_SURFACE);
+                    // longer at the end of each brick. Surfaces end rays too soon for that, and what is behind
+                    // the end of a ray need not be looked up: a ray that would end if each of the next three bricks took
+                    // as much light as the last row did goes on brick by brick, as its first does.
+                    let taken = transmitted / row_light;
+                    let goes_on = transmitted * taken * taken * taken > TERMINATION;
+                    row_light = transmitted;
+                    let most_bricks = select(1u, 3u, goes_on && MODE != MODE_ISO_SURFACE);
                     let wanted = channel_level(0u, level);
                     let most = stretch + sample_at * step;
                     for (var index = 0u; index < most_bricks; index += 1u) {
