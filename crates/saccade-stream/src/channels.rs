@@ -4,6 +4,8 @@ use saccade_core::transfer::{ColorMap, Histogram, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_render::ChannelView;
 
+use crate::detail::Detail;
+
 /// Channels shown at first, of a volume that has more.
 const SHOWN_AT_FIRST: usize = 4;
 
@@ -22,6 +24,11 @@ pub struct Channel {
     pub automatic: bool,
     /// Value of the surface where surfaces are drawn, `[0, 1]`; `None` follows the opacities.
     pub iso: Option<f32>,
+    /// How finely it is drawn.
+    pub detail: Detail,
+    /// The finest level that its values need, as far as the bricks that arrived tell; looked for with
+    /// [`Detail::ByContent`].
+    pub finest_needed: u32,
 }
 
 impl Channel {
@@ -67,6 +74,8 @@ pub(crate) fn of_volume(volume: &Volume) -> Vec<Channel> {
             histogram,
             automatic: true,
             iso: None,
+            detail: Detail::Full,
+            finest_needed: 0,
         };
         channel.follow_histogram(volume, index);
         channel
@@ -77,10 +86,19 @@ pub(crate) fn of_volume(volume: &Volume) -> Vec<Channel> {
 /// Those that are seen, as renderers take them.
 pub(crate) fn views(channels: &[Channel]) -> Vec<ChannelView> {
     let seen = (0..).zip(channels).filter(|(_, channel)| channel.visible);
-    let views = seen.map(|(index, channel)| ChannelView {
-        iso: channel.iso_value(),
-        significant_bits: channel.histogram.significant_bits(),
-        ..ChannelView::new(index, channel.transfer.clone())
+    let views = seen.map(|(index, channel)| {
+        let (levels, coarser) = match &channel.detail {
+            Detail::Full => (0..=u32::MAX, 0),
+            Detail::ByContent => (channel.finest_needed..=u32::MAX, 0),
+            Detail::Chosen { levels, coarser } => (levels.clone(), *coarser),
+        };
+        ChannelView {
+            iso: channel.iso_value(),
+            levels,
+            coarser,
+            significant_bits: channel.histogram.significant_bits(),
+            ..ChannelView::new(index, channel.transfer.clone())
+        }
     });
     views.collect()
 }

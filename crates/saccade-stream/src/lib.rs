@@ -37,6 +37,7 @@
 pub mod brick;
 mod channels;
 mod clock;
+mod detail;
 mod histogram;
 mod host_cache;
 pub mod policy;
@@ -47,6 +48,7 @@ mod session;
 mod settle;
 
 pub use channels::Channel;
+pub use detail::Detail;
 pub use histogram::{Sample, sample};
 pub use session::{Again, Session, SessionError, SessionOptions, Status, Wake};
 #[cfg(not(target_family = "wasm"))]

@@ -12,14 +12,15 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::wgpu::DeviceType;
 use saccade_render::{
-    ChannelError, ChannelView, Delivery, Fidelity, FrameReport, Gpu, MemoryUse, Renderer,
-    RendererError, RendererOptions, Statistics, View,
+    BrickVoxels, ChannelError, ChannelView, Delivery, Fidelity, FrameReport, Gpu, MemoryUse,
+    Renderer, RendererError, RendererOptions, Statistics, View,
 };
 use saccade_source::{ChunkId, ValueRange, VolumeSource};
 
 use crate::brick::{chunks_of, range_of};
 use crate::channels::{self, Channel};
 use crate::clock::Clock;
+use crate::detail::{Content, Detail};
 use crate::histogram::Sample;
 use crate::host_cache::is_touched;
 use crate::policy::{Limits, Pace, Refresh, Retry};
@@ -153,6 +154,8 @@ pub struct Session {
     clock: Clock,
     refresh: Refresh,
     channels: Vec<Channel>,
+    /// How much detail each has.
+    contents: Vec<Content>,
     /// As the renderer has them.
     views: Vec<ChannelView>,
     frames_in_flight: usize,
@@ -230,6 +233,7 @@ impl Session {
             requests,
             clock: Clock::start(),
             refresh: Refresh::new(),
+            contents: vec![Content::default(); channels.len()],
             channels,
             views: Vec::new(),
             frames_in_flight: options.frames_in_flight.max(1),
@@ -336,6 +340,21 @@ impl Session {
     /// [`ChannelError::NoSuchChannel`].
     pub fn set_iso(&mut self, channel: u32, iso: Option<f32>) -> Result<(), ChannelError> {
         self.channel_mut(channel)?.iso = iso;
+        self.put_channels()?;
+        self.is_awaited();
+        Ok(())
+    }
+
+    /// Sets how finely a channel is drawn.
+    ///
+    /// # Errors
+    ///
+    /// [`ChannelError::NoSuchChannel`].
+    pub fn set_detail(&mut self, channel: u32, detail: Detail) -> Result<(), ChannelError> {
+        let of = self.channel_mut(channel)?;
+        // Asked for anew, it is looked for anew.
+        (of.detail, of.finest_needed) = (detail, 0);
+        self.contents[channel as usize] = Content::default();
         self.put_channels()?;
         self.is_awaited();
         Ok(())
@@ -580,7 +599,17 @@ impl Session {
     /// Hands ready bricks to the renderer; whether there may be more.
     fn deliver(&mut self) -> bool {
         let (renderer, clock) = (&mut self.renderer, self.clock);
-        let sink = |id, voxels: saccade_render::BrickVoxels<'_>, freshness| {
+        let (channels, contents) = (&self.channels, &mut self.contents);
+        let mut judged = Vec::new();
+        let sink = |id: BrickId, voxels: BrickVoxels<'_>, freshness| {
+            let channel = id.channel() as usize;
+            if let BrickVoxels::Voxels(voxels) = voxels
+                && channels[channel].detail == Detail::ByContent
+                && contents[channel].wants(id.level())
+            {
+                contents[channel].note(renderer.volume(), id.level(), voxels);
+                judged.push(channel);
+            }
             let delivered = match freshness {
                 Freshness::Current => renderer.deliver(id, voxels),
                 Freshness::Outdated => renderer.deliver_outdated(id, voxels),
@@ -592,6 +621,14 @@ impl Session {
         };
         let delivery = self.pull.deliver(self.drawn + 1, || clock.now(), sink);
         self.dirty |= delivery.bricks > 0;
+        if !judged.is_empty() {
+            for channel in judged {
+                self.channels[channel].finest_needed = self.contents[channel].finest_needed();
+            }
+            if let Err(error) = self.put_channels() {
+                log::error!("channels were refused: {error}");
+            }
+        }
         delivery.cut
     }
 

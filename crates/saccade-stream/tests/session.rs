@@ -21,7 +21,7 @@ use saccade_source::maybe_send::{BoxFuture, BoxStream};
 use saccade_source::memory::ArraySource;
 use saccade_source::{Change, Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
 use saccade_stream::policy::{Limits, Retry};
-use saccade_stream::{Again, Session, SessionOptions, SettleError};
+use saccade_stream::{Again, Detail, Session, SessionOptions, SettleError};
 
 const EXTENT: UVec3 = UVec3::new(90, 70, 50);
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -542,6 +542,53 @@ impl VolumeSource for Counted {
 
     fn changes(&self) -> BoxStream<'static, Change> {
         self.inner.changes()
+    }
+}
+
+/// Waves along x and y.
+fn waves(wavelength: f64) -> Arc<ArraySource> {
+    let extent = UVec3::new(160, 150, 90);
+    let volume = Volume::new("waves", extent, DVec3::new(4.0, 4.0, 4.0)).unwrap();
+    let wave = |x: u32| (f64::from(x) * std::f64::consts::TAU / wavelength).sin();
+    #[expect(clippy::cast_possible_truncation, reason = "20 to 220")]
+    #[expect(clippy::cast_sign_loss, reason = "20 to 220")]
+    let value = |at: UVec3| (120.0 + 50.0 * wave(at.x) + 50.0 * wave(at.y)) as u8;
+    let voxels = VoxelBox::of_size(extent).iter().map(value).collect();
+    Arc::new(ArraySource::new(volume, voxels).unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_channel_is_drawn_as_finely_as_its_values_need() {
+    let Some(gpu) = test_gpu().await else { return };
+    let chosen = Detail::Chosen {
+        levels: 0..=u32::MAX,
+        coarser: 1,
+    };
+    for (wavelength, detail, finest) in [
+        (40.0, Detail::Full, 0),
+        (40.0, Detail::ByContent, 1),
+        (4.0, Detail::ByContent, 0),
+        (4.0, chosen, 1),
+    ] {
+        let source = waves(wavelength);
+        let view = View {
+            lod_bias: -20.0,
+            ..view(source.as_ref())
+        };
+        let mut session = Session::new(&gpu, source, options()).unwrap();
+        session.set_detail(0, detail.clone()).unwrap();
+        assert!(session.set_detail(1, Detail::Full).is_err());
+        let _ = picture(&mut session, &view).await;
+        let status = session.frame(&view);
+        let case = format!("waves of {wavelength} voxels, {detail:?}");
+        assert_eq!(status.fidelity.level, Some(finest), "{case}");
+        let by_content = detail == Detail::ByContent;
+        let needed = if by_content { finest } else { 0 };
+        assert_eq!(session.channels()[0].finest_needed, needed, "{case}");
+        // Asked for in full again, it is drawn in full.
+        session.set_detail(0, Detail::Full).unwrap();
+        let _ = picture(&mut session, &view).await;
+        assert_eq!(session.frame(&view).fidelity.level, Some(0), "{case}");
     }
 }
 

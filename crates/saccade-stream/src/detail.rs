@@ -1,0 +1,232 @@
+//! How finely a channel is drawn, and how fine its values are [001 sections 7.4 and 11.2].
+
+use std::ops::RangeInclusive;
+
+use glam::{DVec3, UVec3};
+use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS};
+use saccade_core::volume::{Dtype, Volume};
+
+/// Bricks of a level that are looked at, and have to be, before it is judged.
+const JUDGED_BRICKS: u32 = 16;
+/// A level is not needed when the next coarser one has all but this share of its variance.
+const MOST_LOST: f64 = 0.01;
+
+/// How finely a channel is drawn.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Detail {
+    /// One voxel a pixel, as the view asks for.
+    #[default]
+    Full,
+    /// No level that differs from the next coarser one by less than a hundredth of the values' variance: found
+    /// from the bricks that arrive.
+    ByContent,
+    /// As somebody chose.
+    Chosen {
+        /// Levels that are drawn, 0 the finest; the nearest of them where another is wanted.
+        levels: RangeInclusive<u32>,
+        /// Levels coarser than others that suffice.
+        coarser: u32,
+    },
+}
+
+/// How much detail the levels of a channel have, from some of its bricks.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Content {
+    levels: Vec<Spread>,
+}
+
+/// Squared differences of values.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Spread {
+    bricks: u32,
+    /// From the mean of their brick.
+    all: f64,
+    /// From the mean of the voxel of the next coarser level that they are in.
+    lost: f64,
+}
+
+impl Content {
+    /// Whether a brick of this level would tell something new.
+    pub(crate) fn wants(&self, level: u32) -> bool {
+        let known = self.levels.get(level as usize);
+        known.is_none_or(|spread| spread.bricks < JUDGED_BRICKS)
+    }
+
+    /// Takes a brick's values, stored with its border, little-endian, into account.
+    pub(crate) fn note(&mut self, volume: &Volume, level: u32, voxels: &[u8]) {
+        let (at, next) = (level as usize, level as usize + 1);
+        let Some([here, coarser]) = volume.levels.get(at..=next) else {
+            return;
+        };
+        if self.levels.len() <= at {
+            self.levels.resize(next, Spread::default());
+        }
+        let spread = &mut self.levels[at];
+        spread.bricks += 1;
+        let edge = block_edge(coarser.downsampling / here.downsampling);
+        let values: Vec<u16> = match volume.dtype {
+            Dtype::Uint16 => {
+                let (pairs, _) = voxels.as_chunks::<2>();
+                pairs.iter().copied().map(u16::from_le_bytes).collect()
+            }
+            _ => voxels.iter().copied().map(u16::from).collect(),
+        };
+        if values.len() == BRICK_STORED_VOXELS {
+            spread.add(&values, edge);
+        }
+    }
+
+    /// The finest level that has to be drawn, as far as is known.
+    pub(crate) fn finest_needed(&self) -> u32 {
+        let needed = |s: &Spread| s.bricks >= JUDGED_BRICKS && s.lost > MOST_LOST * s.all;
+        let not_needed =
+            |s: &Spread| s.bricks >= JUDGED_BRICKS && s.all > 0.0 && s.lost <= MOST_LOST * s.all;
+        let first = self.levels.iter().position(needed);
+        let below = &self.levels[..first.unwrap_or(self.levels.len())];
+        let last = below.iter().rposition(not_needed);
+        last.map_or(0, |level| u32::try_from(level).unwrap_or(u32::MAX) + 1)
+    }
+}
+
+/// Voxels of a level, per axis, that one of the next coarser level is the mean of.
+fn block_edge(ratio: DVec3) -> UVec3 {
+    ratio
+        .round()
+        .clamp(DVec3::ONE, DVec3::splat(f64::from(BRICK_EDGE)))
+        .as_uvec3()
+}
+
+impl Spread {
+    /// Blocks with a voxel that was not acquired are left out.
+    fn add(&mut self, values: &[u16], edge: UVec3) {
+        let count = f64::from(edge.element_product());
+        let (mut blocks, mut sum, mut squares) = (0.0, 0.0, 0.0);
+        let starts = |axis: usize| {
+            let (edge, from) = (edge[axis], BRICK_BORDER);
+            (0..BRICK_EDGE / edge).map(move |block| from + block * edge)
+        };
+        for z in starts(2) {
+            for y in starts(1) {
+                for x in starts(0) {
+                    let (mut of_block, mut of_squares, mut least) = (0.0, 0.0, u16::MAX);
+                    for k in z..z + edge.z {
+                        for j in y..y + edge.y {
+                            let row = (k * BRICK_STORED_EDGE + j) * BRICK_STORED_EDGE + x;
+                            let row = row as usize;
+                            for &value in &values[row..row + edge.x as usize] {
+                                least = least.min(value);
+                                of_block += f64::from(value);
+                                of_squares += f64::from(value) * f64::from(value);
+                            }
+                        }
+                    }
+                    if least > 0 {
+                        blocks += 1.0;
+                        sum += of_block;
+                        squares += of_squares;
+                        self.lost += of_squares - of_block * of_block / count;
+                    }
+                }
+            }
+        }
+        if blocks > 0.0 {
+            self.all += squares - sum * sum / (blocks * count);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use saccade_core::voxel_box::VoxelBox;
+
+    use super::*;
+
+    fn volume(dtype: Dtype) -> Volume {
+        let volume = Volume::new("v", UVec3::new(4000, 4000, 400), DVec3::new(4.0, 4.0, 40.0));
+        Volume {
+            dtype,
+            ..volume.unwrap()
+        }
+    }
+
+    /// A stored brick.
+    fn brick(dtype: Dtype, value: impl Fn(UVec3) -> f64) -> Vec<u8> {
+        let cells = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE));
+        #[expect(clippy::cast_possible_truncation, reason = "between 1 and 60000")]
+        #[expect(clippy::cast_sign_loss, reason = "between 1 and 60000")]
+        let value = |at| value(at) as u16;
+        let bytes = cells.iter().map(value).flat_map(|v| match dtype {
+            Dtype::Uint16 => v.to_le_bytes().to_vec(),
+            _ => v.to_le_bytes()[..1].to_vec(),
+        });
+        bytes.collect()
+    }
+
+    fn noted(dtype: Dtype, levels: &[(u32, f64)]) -> Content {
+        let volume = volume(dtype);
+        let scale = if dtype == Dtype::Uint16 { 250.0 } else { 1.0 };
+        let mut content = Content::default();
+        for &(level, wavelength) in levels {
+            let wave = |x: u32| (f64::from(x) * std::f64::consts::TAU / wavelength).sin();
+            let value = |at: UVec3| scale * (120.0 + 50.0 * wave(at.x) + 50.0 * wave(at.y));
+            for _ in 0..JUDGED_BRICKS {
+                assert!(content.wants(level));
+                content.note(&volume, level, &brick(dtype, value));
+            }
+            assert!(!content.wants(level));
+        }
+        content
+    }
+
+    #[test]
+    fn levels_that_the_next_one_shows_as_well_are_not_needed() {
+        for dtype in [Dtype::Uint8, Dtype::Uint16] {
+            let needed = |levels: &[(u32, f64)]| noted(dtype, levels).finest_needed();
+            // Long waves at level 0, so level 1 suffices; it has short ones.
+            assert_eq!(needed(&[(0, 32.0)]), 1);
+            assert_eq!(needed(&[(0, 32.0), (1, 4.0)]), 1);
+            assert_eq!(needed(&[(0, 32.0), (1, 32.0), (2, 5.0)]), 2);
+            assert_eq!(needed(&[(0, 4.0)]), 0);
+            // Not seen yet is not more than what is coarser.
+            assert_eq!(needed(&[(2, 32.0)]), 3);
+            assert_eq!(needed(&[(0, 4.0), (2, 32.0)]), 0, "level 0 is needed");
+        }
+    }
+
+    #[test]
+    fn what_is_lost_is_what_block_means_do_not_say() {
+        // Alternating 10 and 30 along x: blocks of two lose all of it, of one nothing.
+        let values: Vec<u16> = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE))
+            .iter()
+            .map(|at| if at.x % 2 == 0 { 10 } else { 30 })
+            .collect();
+        let voxels = f64::from(BRICK_EDGE.pow(3));
+        let mut spread = Spread::default();
+        spread.add(&values, UVec3::new(2, 1, 1));
+        assert!((spread.all - 100.0 * voxels).abs() < 1e-3);
+        assert!((spread.lost - 100.0 * voxels).abs() < 1e-3);
+        let mut along_y = Spread::default();
+        along_y.add(&values, UVec3::new(1, 2, 1));
+        assert!((along_y.all - 100.0 * voxels).abs() < 1e-3 && along_y.lost.abs() < 1e-3);
+    }
+
+    #[test]
+    fn nothing_is_judged_by_few_bricks_or_by_what_was_not_acquired() {
+        let volume = volume(Dtype::Uint8);
+        let mut content = Content::default();
+        content.note(&volume, 0, &brick(Dtype::Uint8, |_| 90.0));
+        assert_eq!(content.finest_needed(), 0);
+        let mut content = Content::default();
+        // Half of it not acquired: a step that no voxel has.
+        let half = brick(Dtype::Uint8, |at| if at.x < 17 { 0.0 } else { 90.0 });
+        for _ in 0..JUDGED_BRICKS {
+            content.note(&volume, 0, &half);
+        }
+        assert_eq!(content.levels[0].lost, 0.0);
+        assert_eq!(content.finest_needed(), 0, "no variance says nothing");
+        let coarsest = u32::try_from(volume.levels.len() - 1).unwrap();
+        content.note(&volume, coarsest, &half);
+        content.note(&volume, coarsest + 7, &half);
+        assert!(content.wants(coarsest), "there is nothing coarser");
+    }
+}
