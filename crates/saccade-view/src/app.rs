@@ -15,7 +15,7 @@ use web_time::Instant;
 use crate::acquisition::{Acquisition, AcquisitionReader};
 use crate::facts::{Facts, PageStatus, line};
 use crate::navigate::{Input, moved};
-use crate::options::{ViewOptions, show_channels};
+use crate::options::{ViewOptions, set_details, show_channels};
 use crate::panel::{self, About, Open, Opener, Settings};
 use crate::picture::{Picture, Place};
 use crate::quality::{Cost, Events, Quality};
@@ -103,6 +103,7 @@ impl App {
         let home = Camera::around(source.volume());
         let mut session = Session::new(&gpu, source, session_options)?;
         show_channels(&mut session, options.channels.as_deref(), options.transfer)?;
+        set_details(&mut session, &options.details)?;
         Ok(Self {
             session,
             state,
@@ -159,6 +160,7 @@ impl App {
         let side = Panel::right("settings").default_size(270.0).min_size(220.0);
         let home = side.show_collapsible(ui, &mut open, |ui| {
             let about = About {
+                camera: &self.camera,
                 notes: &self.notes,
                 opener: self.opener.as_mut(),
             };
@@ -214,6 +216,7 @@ impl App {
             background: self.settings.background,
             mode: self.settings.shown.drawn_mode(),
             clip: self.settings.shown.clip(self.session.volume()),
+            heat: self.settings.shown.heat,
             ..View::new(self.camera, place.scaled(scale))
         };
         let status = self.session.frame(&view);

@@ -445,6 +445,8 @@ mod tests {
             },
             automatic: true,
             iso: None,
+            detail: saccade_stream::Detail::Full,
+            finest_needed: 0,
         };
         let seen = Channel {
             visible: true,

@@ -36,6 +36,7 @@ mod options;
 mod page;
 mod panel;
 mod picture;
+mod plane;
 mod quality;
 mod setup;
 mod shown;
@@ -47,11 +48,12 @@ mod native;
 mod web;
 
 pub use acquisition::AcquisitionReader;
-pub use options::{BackgroundError, ViewOptions, background_from_text, show_channels};
+pub use options::{BackgroundError, ViewOptions, background_from_text, set_details, show_channels};
 pub use page::{PageError, PageOptions};
+pub use plane::{Plane, plane_from_text};
 pub use shown::{
-    OutsideError, Shown, ShownError, Slice, box_from_text, channels_from_text, mode_from_text,
-    slice_from_text,
+    MOST_CUTS, OutsideError, Shown, ShownError, box_from_text, channels_from_text,
+    details_from_text, heat_from_text, mode_from_text, thickness_from_text,
 };
 
 #[cfg(not(target_family = "wasm"))]

@@ -3,8 +3,8 @@
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{TransferFunction, linear_from_srgb};
 use saccade_render::ChannelError;
-use saccade_stream::Session;
 use saccade_stream::policy::Limits;
+use saccade_stream::{Detail, Session};
 
 use crate::shown::Shown;
 
@@ -17,6 +17,8 @@ pub struct ViewOptions {
     pub transfer: Option<TransferFunction>,
     /// Channels that are seen; the first few otherwise.
     pub channels: Option<Vec<u32>>,
+    /// How finely channels are drawn, one or all of them; as the view asks for otherwise.
+    pub details: Vec<(Option<u32>, Detail)>,
     /// Which part of the volume, and how.
     pub shown: Shown,
     /// Behind everything, linear RGB in `[0, 1]`.
@@ -35,6 +37,7 @@ impl Default for ViewOptions {
             camera: None,
             transfer: None,
             channels: None,
+            details: Vec::new(),
             shown: Shown::default(),
             background: [0.0; 3],
             ui: true,
@@ -69,6 +72,24 @@ pub fn show_channels(
     if let Some(transfer) = transfer {
         let first = channels.and_then(|channels| channels.first());
         session.set_transfer_function(first.copied().unwrap_or(0), transfer)?;
+    }
+    Ok(())
+}
+
+/// Draws channels so finely, later wishes after earlier ones; `None` stands for all of them.
+///
+/// # Errors
+///
+/// [`ChannelError`] for channels that the volume does not have.
+pub fn set_details(
+    session: &mut Session,
+    details: &[(Option<u32>, Detail)],
+) -> Result<(), ChannelError> {
+    let all = u32::try_from(session.channels().len()).unwrap_or(u32::MAX);
+    for (channel, detail) in details {
+        for channel in channel.map_or(0..all, |channel| channel..channel.saturating_add(1)) {
+            session.set_detail(channel, detail.clone())?;
+        }
     }
     Ok(())
 }

@@ -5,8 +5,10 @@ use saccade_core::transfer::TransferFunction;
 use saccade_source::objects::{Location, LocationError};
 
 use crate::options::{BackgroundError, ViewOptions, background_from_text};
+use crate::plane::plane_from_text;
 use crate::shown::{
-    ShownError, box_from_text, channels_from_text, mode_from_text, slice_from_text,
+    MOST_CUTS, ShownError, box_from_text, channels_from_text, details_from_text, heat_from_text,
+    mode_from_text, thickness_from_text,
 };
 
 /// What a page's address asks for.
@@ -30,7 +32,7 @@ pub enum PageError {
     /// `background=`.
     #[error(transparent)]
     Background(#[from] BackgroundError),
-    /// `channels=`, `mode=`, `clip=` or `slice=`.
+    /// `channels=`, `detail=`, `mode=`, `clip=`, `slice=`, `slab=`, `cut=` or `heat=`.
     #[error(transparent)]
     Shown(#[from] ShownError),
     /// `source=`.
@@ -45,6 +47,12 @@ pub enum PageError {
         /// What is wrong with it.
         #[from]
         source: serde_json::Error,
+    },
+    /// `cut=` too often.
+    #[error("{most} planes can cut, and the address has more (cut=)")]
+    TooManyCuts {
+        /// How many can.
+        most: usize,
     },
     /// `ui=`.
     #[error("ui={value} is neither on nor off")]
@@ -75,7 +83,15 @@ impl PageOptions {
                 "channels" => page.view.channels = Some(channels_from_text(&value)?),
                 "mode" => page.view.shown.mode = mode_from_text(&value)?,
                 "clip" => page.view.shown.within = Some(box_from_text(&value)?),
-                "slice" => page.view.shown.slice = Some(slice_from_text(&value)?),
+                "detail" => page.view.details = details_from_text(&value)?,
+                "slice" => page.view.shown.slice = Some(plane_from_text(&value)?),
+                "slab" => page.view.shown.slab_nm = thickness_from_text(&value)?,
+                "cut" => {
+                    if !page.view.shown.cut(plane_from_text(&value)?) {
+                        return Err(PageError::TooManyCuts { most: MOST_CUTS });
+                    }
+                }
+                "heat" => page.view.shown.heat = Some(heat_from_text(&value)?),
                 "background" => page.view.background = background_from_text(&value)?,
                 "ui" => page.view.ui = on_or_off(value)?,
                 _ => {}
@@ -119,6 +135,7 @@ mod tests {
     use saccade_core::transfer::Histogram;
 
     use super::*;
+    use crate::plane::Plane;
 
     fn page(pairs: &[(&str, &str)]) -> Result<PageOptions, PageError> {
         PageOptions::from_pairs(pairs.iter().map(|&(n, v)| (n.to_owned(), v.to_owned())))
@@ -147,6 +164,11 @@ mod tests {
             ("mode", "surface"),
             ("clip", "0,0,0,9,8,7"),
             ("slice", "x=3"),
+            ("slab", "80"),
+            ("cut", "0,1,1@4,5,6"),
+            ("cut", "z=2"),
+            ("heat", "lookups=8"),
+            ("detail", "content,2:1"),
             ("ui", "off"),
         ]);
         let PageOptions { volume, view, .. } = page.unwrap();
@@ -156,15 +178,26 @@ mod tests {
         assert_eq!(view.background, [1.0; 3]);
         assert_eq!(view.channels, Some(vec![2, 0]));
         let clip = [glam::DVec3::ZERO, glam::DVec3::new(9.0, 8.0, 7.0)];
-        let slice = crate::shown::Slice { axis: 0, at: 3.0 };
+        let oblique = Plane {
+            normal: glam::DVec3::new(0.0, 1.0, 1.0),
+            point: glam::DVec3::new(4.0, 5.0, 6.0),
+        };
         assert_eq!(
             view.shown,
             crate::shown::Shown {
                 mode: saccade_render::Mode::IsoSurface,
                 within: Some(clip),
-                slice: Some(slice),
+                slice: Some(Plane::across(0, 3.0)),
+                slab_nm: 80.0,
+                cuts: [Some(oblique), Some(Plane::across(2, 2.0)), None, None],
+                heat: Some(saccade_render::Heat {
+                    of: saccade_render::Work::Lookups,
+                    full: 8.0,
+                }),
             }
         );
+        assert_eq!(view.details[0], (None, saccade_stream::Detail::ByContent));
+        assert_eq!(view.details.len(), 2);
         assert!(!view.ui);
     }
 
@@ -204,10 +237,23 @@ mod tests {
             ("mode", "dreamy"),
             ("clip", "1,2"),
             ("slice", "40"),
+            ("slab", "thick"),
+            ("cut", "w=4"),
+            ("heat", "fire"),
+            ("detail", "nice"),
             ("ui", "maybe"),
         ] {
             let error = page(&[(name, value)]).unwrap_err().to_string();
-            assert!(error.contains(name), "{error}");
+            let named = match name {
+                "slice" | "cut" => "plane",
+                "slab" => "thickness",
+                "heat" => "work of rays",
+                name => name,
+            };
+            assert!(error.contains(named), "{error}");
         }
+        let cuts = [("cut", "x=1"); 5];
+        let error = page(&cuts).unwrap_err().to_string();
+        assert!(error.contains("4 planes"), "{error}");
     }
 }

@@ -1,13 +1,15 @@
 //! The panel beside the picture and the line below it.
 
 use egui::{Color32, RichText, Slider, Ui};
+use saccade_core::camera::Camera;
 use saccade_core::transfer::{ColorMap, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
-use saccade_render::Mode;
-use saccade_stream::Session;
+use saccade_render::{Heat, Mode, Work};
+use saccade_stream::{Detail, Session};
 
 use crate::facts::{Piece, Tone};
-use crate::shown::{AXES, Shown, Slice};
+use crate::plane::{AXES, Plane};
+use crate::shown::{MOST_CUTS, Shown, WORKS};
 use crate::transfer_editor::{self, TransferEditor};
 
 /// What the user may set, apart from the camera and the transfer function.
@@ -59,6 +61,8 @@ impl Opener {
 
 /// What the panel tells of the volume, and how another is opened.
 pub(crate) struct About<'a> {
+    /// From where it is seen.
+    pub(crate) camera: &'a Camera,
     /// What the user should know of how values are shown, in sentences.
     pub(crate) notes: &'a [String],
     /// Where another image can be opened.
@@ -88,9 +92,10 @@ pub(crate) fn show(
                 ui.separator();
             }
             transfer(ui, session, editor, settings.selected);
+            detail(ui, session, settings.selected);
             ui.separator();
             let volume = session.volume().clone();
-            shown(ui, session, settings, &volume);
+            shown(ui, session, settings, &volume, about.camera);
             ui.separator();
             picture(ui, settings);
             ui.separator();
@@ -194,7 +199,13 @@ fn transfer(ui: &mut Ui, session: &mut Session, editor: &mut TransferEditor, sel
 }
 
 /// How samples become a picture, and what is cut away.
-fn shown(ui: &mut Ui, session: &mut Session, settings: &mut Settings, volume: &Volume) {
+fn shown(
+    ui: &mut Ui,
+    session: &mut Session,
+    settings: &mut Settings,
+    volume: &Volume,
+    camera: &Camera,
+) {
     let shown = &mut settings.shown;
     ui.horizontal(|ui| {
         for (mode, name, what) in [
@@ -231,22 +242,8 @@ fn shown(ui: &mut Ui, session: &mut Session, settings: &mut Settings, volume: &V
         }
     }
     let extent = volume.extent().as_dvec3();
-    ui.horizontal(|ui| {
-        ui.label("Slice");
-        let axis = shown.slice.map(|slice| slice.axis);
-        if ui.selectable_label(axis.is_none(), "none").clicked() {
-            shown.slice = None;
-        }
-        for (index, name) in AXES.into_iter().enumerate() {
-            if ui.selectable_label(axis == Some(index), name).clicked() {
-                let at = extent[index] / 2.0;
-                shown.slice = Some(Slice { axis: index, at });
-            }
-        }
-    });
-    if let Some(slice) = &mut shown.slice {
-        ui.add(Slider::new(&mut slice.at, 0.0..=extent[slice.axis]).text("voxel"));
-    }
+    slice(ui, shown, volume, camera);
+    heat(ui, &mut shown.heat);
     ui.collapsing("Cut away", |ui| {
         let [mut low, mut high] = shown.within.unwrap_or([glam::DVec3::ZERO, extent]);
         let mut changed = false;
@@ -259,10 +256,168 @@ fn shown(ui: &mut Ui, session: &mut Session, settings: &mut Settings, volume: &V
         if changed {
             shown.within = Some([low, high.max(low)]);
         }
-        if ui.button("Nothing").clicked() {
-            shown.within = None;
+        for cut in &mut shown.cuts {
+            let Some(plane) = cut else { continue };
+            let keeps = ui
+                .horizontal(|ui| {
+                    along_normal(ui, plane, volume);
+                    !ui.button("✖")
+                        .on_hover_text("Take this plane away")
+                        .clicked()
+                })
+                .inner;
+            if !keeps {
+                *cut = None;
+            }
+        }
+        ui.horizontal(|ui| {
+            let free = shown.cuts.iter().any(Option::is_none);
+            let new = ui.add_enabled(free, egui::Button::new("Plane facing the eye"));
+            if new
+                .on_hover_text("What is nearer than the middle of the view is cut away")
+                .clicked()
+            {
+                shown.cut(facing(camera, volume));
+            }
+            if ui.button("Nothing").clicked() {
+                (shown.within, shown.cuts) = (None, [None; MOST_CUTS]);
+            }
+        });
+    });
+}
+
+/// One plane, or a slab around it, instead of all depths.
+fn slice(ui: &mut Ui, shown: &mut Shown, volume: &Volume, camera: &Camera) {
+    let extent = volume.extent().as_dvec3();
+    ui.horizontal(|ui| {
+        ui.label("Slice");
+        let axis = shown.slice.map(|plane| plane.axis().map(|(axis, _)| axis));
+        if ui.selectable_label(axis.is_none(), "none").clicked() {
+            shown.slice = None;
+        }
+        for (index, name) in AXES.into_iter().enumerate() {
+            if ui
+                .selectable_label(axis == Some(Some(index)), name)
+                .clicked()
+            {
+                shown.slice = Some(Plane::across(index, extent[index] / 2.0));
+            }
+        }
+        let oblique = ui.selectable_label(axis == Some(None), "oblique");
+        if oblique
+            .on_hover_text("Facing the eye, through the middle of the view")
+            .clicked()
+        {
+            shown.slice = Some(facing(camera, volume));
         }
     });
+    let Some(plane) = &mut shown.slice else {
+        return;
+    };
+    match plane.axis() {
+        Some((axis, mut at)) => {
+            if ui
+                .add(Slider::new(&mut at, 0.0..=extent[axis]).text("voxel"))
+                .changed()
+            {
+                *plane = Plane::across(axis, at);
+            }
+        }
+        None => along_normal(ui, plane, volume),
+    }
+    let thickest = 2.0 * plane.reach(volume);
+    ui.add(Slider::new(&mut shown.slab_nm, 0.0..=thickest).text("nm thick"));
+}
+
+/// Moves a plane along its normal.
+fn along_normal(ui: &mut Ui, plane: &mut Plane, volume: &Volume) {
+    let (mut offset, reach) = (plane.offset(volume), plane.reach(volume));
+    let slider = Slider::new(&mut offset, -reach..=reach).text("nm from the middle");
+    if ui.add(slider).changed() {
+        *plane = plane.at_offset(offset, volume);
+    }
+}
+
+/// The plane through the middle of the view that faces the eye.
+fn facing(camera: &Camera, volume: &Volume) -> Plane {
+    Plane {
+        normal: camera.physical_from_eye_axes().z_axis,
+        point: camera.target.xyz / volume.voxel_nm,
+    }
+}
+
+/// The work of rays instead of the volume.
+fn heat(ui: &mut Ui, heat: &mut Option<Heat>) {
+    let name = |heat: Option<Heat>| heat.map_or("the volume", |heat| work_name(heat.of));
+    let before = *heat;
+    egui::ComboBox::from_label("is drawn")
+        .selected_text(name(before))
+        .show_ui(ui, |ui| {
+            ui.selectable_value(heat, None, name(None));
+            for (_, of, full) in WORKS {
+                let is_this = before.is_some_and(|heat| heat.of == of);
+                if ui.selectable_label(is_this, work_name(of)).clicked() && !is_this {
+                    *heat = Some(Heat { of, full });
+                }
+            }
+        })
+        .response
+        .on_hover_text("What each ray took: black, red, yellow, white");
+    if let Some(heat) = heat {
+        ui.add(
+            Slider::new(&mut heat.full, 1.0..=4096.0)
+                .logarithmic(true)
+                .text("a ray is white"),
+        );
+    }
+}
+
+fn work_name(work: Work) -> &'static str {
+    match work {
+        Work::Lookups => "page table entries a ray",
+        Work::Nodes => "octree nodes a ray",
+        Work::Samples => "samples a ray",
+    }
+}
+
+/// How finely a channel is drawn.
+fn detail(ui: &mut Ui, session: &mut Session, selected: u32) {
+    let Some(channel) = session.channels().get(selected as usize) else {
+        return;
+    };
+    let (before, needed) = (channel.detail.clone(), channel.finest_needed);
+    let coarser = |coarser| Detail::Chosen {
+        levels: 0..=u32::MAX,
+        coarser,
+    };
+    let mut detail = before.clone();
+    let name = |detail: &Detail| match detail {
+        Detail::Full => "as fine as the view".to_owned(),
+        Detail::ByContent if *detail == before && needed > 0 => {
+            format!("by content: from level {needed}")
+        }
+        Detail::ByContent => "by content".to_owned(),
+        Detail::Chosen { coarser: 1, .. } => "1 level coarser".to_owned(),
+        Detail::Chosen { coarser, .. } => format!("{coarser} levels coarser"),
+    };
+    egui::ComboBox::from_label("Detail")
+        .selected_text(name(&before))
+        .show_ui(ui, |ui| {
+            for choice in [Detail::Full, Detail::ByContent, coarser(1), coarser(2), coarser(3)] {
+                let text = name(&choice);
+                ui.selectable_value(&mut detail, choice, text);
+            }
+        })
+        .response
+        .on_hover_text(
+            "Coarser channels leave memory to others. By content: levels that differ by less than a \
+             hundredth from the next coarser one are left out.",
+        );
+    if detail != before
+        && let Err(error) = session.set_detail(selected, detail)
+    {
+        log::error!("{error}");
+    }
 }
 
 fn polarity(ui: &mut Ui, transfer: &mut TransferFunction) -> bool {

@@ -3,35 +3,43 @@
 use glam::DVec3;
 use saccade_core::space::Point;
 use saccade_core::volume::Volume;
-use saccade_render::{Clip, Mode, Slab};
+use saccade_render::{Clip, Heat, Mode, Work};
+use saccade_stream::Detail;
+
+use crate::plane::{AXES, Plane};
+
+/// Planes that cut something away, at most.
+pub const MOST_CUTS: usize = 4;
 
 /// Which part of a volume is shown, and how.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Shown {
-    /// How samples become colours. A slice shows values as they are, whatever this says.
+    /// How samples become colours. A plane shows values as they are, whatever this says.
     pub mode: Mode,
     /// Two opposite corners of the part that is seen \[level-0 voxels\].
     pub within: Option<[DVec3; 2]>,
     /// One plane instead of all depths.
-    pub slice: Option<Slice>,
+    pub slice: Option<Plane>,
+    /// How thick what is shown around that plane is \[nm\]; 0 is the plane alone.
+    pub slab_nm: f64,
+    /// Nothing is seen on the sides that these do not point to.
+    pub cuts: [Option<Plane>; MOST_CUTS],
+    /// The work of rays instead of the volume.
+    pub heat: Option<Heat>,
 }
 
-/// A plane across an axis.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Slice {
-    /// 0 for x, 1 for y, 2 for z.
-    pub axis: usize,
-    /// Where, along it \[level-0 voxels\].
-    pub at: f64,
-}
-
-/// Names of axes.
-pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
 /// Names of modes, as addresses have them.
 const MODES: [(&str, Mode); 3] = [
     ("light", Mode::EmissionAbsorption),
     ("maximum", Mode::Maximum),
     ("surface", Mode::IsoSurface),
+];
+
+/// Names of what rays do, as addresses have them, and what is much of it for a ray.
+pub(crate) const WORKS: [(&str, Work, f32); 3] = [
+    ("lookups", Work::Lookups, 16.0),
+    ("nodes", Work::Nodes, 128.0),
+    ("samples", Work::Samples, 512.0),
 ];
 
 /// Text that names nothing that can be shown.
@@ -47,7 +55,7 @@ pub struct ShownError {
 }
 
 impl ShownError {
-    fn of<T>(text: &str, what: &'static str, wanted: &'static str) -> Result<T, Self> {
+    pub(crate) fn of<T>(text: &str, what: &'static str, wanted: &'static str) -> Result<T, Self> {
         let text = text.to_owned();
         Err(Self { text, what, wanted })
     }
@@ -85,25 +93,6 @@ pub fn box_from_text(text: &str) -> Result<[DVec3; 2], ShownError> {
     )
 }
 
-/// A plane from an axis and a number, as in `z=40` \[level-0 voxels\].
-///
-/// # Errors
-///
-/// [`ShownError`] on anything else.
-pub fn slice_from_text(text: &str) -> Result<Slice, ShownError> {
-    let parts = text.split_once('=');
-    let axis = parts.and_then(|(axis, _)| AXES.iter().position(|name| *name == axis.trim()));
-    let at = parts.and_then(|(_, at)| at.trim().parse().ok());
-    match axis.zip(at.filter(|at: &f64| at.is_finite())) {
-        Some((axis, at)) => Ok(Slice { axis, at }),
-        None => ShownError::of(
-            text,
-            "slice",
-            "an axis and a voxel of the finest level, as in z=40",
-        ),
-    }
-}
-
 /// Channels from their numbers with commas, counted from 0.
 ///
 /// # Errors
@@ -121,7 +110,78 @@ pub fn channels_from_text(text: &str) -> Result<Vec<u32>, ShownError> {
     })
 }
 
-fn numbers(text: &str) -> Option<Vec<f64>> {
+/// The work of rays from `lookups`, `nodes` or `samples`, and how much of it is drawn white, as in `nodes=40`.
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else.
+pub fn heat_from_text(text: &str) -> Result<Heat, ShownError> {
+    let (name, full) = match text.split_once('=') {
+        Some((name, full)) => (name.trim(), Some(full.trim().parse::<f32>().ok())),
+        None => (text, None),
+    };
+    let known = WORKS.iter().find(|(known, ..)| *known == name);
+    let heat = known.and_then(|&(_, of, usual)| {
+        let full = full.unwrap_or(Some(usual))?;
+        (full.is_finite() && full > 0.0).then_some(Heat { of, full })
+    });
+    heat.map_or_else(
+        || {
+            let wanted = "lookups, nodes or samples, and what is drawn white, as in nodes=40";
+            ShownError::of(text, "work of rays", wanted)
+        },
+        Ok,
+    )
+}
+
+/// How finely channels are drawn: `full`, `content` or levels coarser, as in `1`; for all of them, or each as in
+/// `0:full,3:2`.
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else.
+pub fn details_from_text(text: &str) -> Result<Vec<(Option<u32>, Detail)>, ShownError> {
+    let one = |text: &str| {
+        let (channel, detail) = match text.split_once(':') {
+            Some((channel, detail)) => (Some(channel.trim().parse().ok()?), detail),
+            None => (None, text),
+        };
+        let detail = match detail.trim() {
+            "full" => Detail::Full,
+            "content" => Detail::ByContent,
+            levels => Detail::Chosen {
+                levels: 0..=u32::MAX,
+                coarser: levels.parse().ok()?,
+            },
+        };
+        Some((channel, detail))
+    };
+    let details: Option<Vec<_>> = text.split(',').map(one).collect();
+    details.map_or_else(
+        || {
+            let wanted =
+                "full, content or a number of levels, for all channels or each, as in 0:full,3:2";
+            ShownError::of(text, "detail of channels", wanted)
+        },
+        Ok,
+    )
+}
+
+/// A length that is not negative \[nm\].
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else.
+pub fn thickness_from_text(text: &str) -> Result<f64, ShownError> {
+    let nm = text.trim().parse().ok();
+    nm.filter(|nm: &f64| nm.is_finite() && *nm >= 0.0)
+        .map_or_else(
+            || ShownError::of(text, "thickness", "nanometres, as in 400"),
+            Ok,
+        )
+}
+
+pub(crate) fn numbers(text: &str) -> Option<Vec<f64>> {
     let numbers = text
         .split(',')
         .map(|number| number.trim().parse::<f64>().ok());
@@ -142,6 +202,14 @@ pub enum OutsideError {
         at: f64,
         /// The last voxel there is.
         last: u32,
+    },
+    /// The oblique plane does not meet the volume.
+    #[error(
+        "the slice passes the volume at a distance of {away:.0} nm; give a point inside the volume"
+    )]
+    Oblique {
+        /// How far away \[nm\].
+        away: f64,
     },
     /// The box does not meet the volume, or the plane does not meet the box.
     #[error(
@@ -172,14 +240,26 @@ impl Shown {
         let extent = volume.extent();
         let mut low = DVec3::ZERO;
         let mut high = extent.as_dvec3();
-        if let Some(Slice { axis, at }) = self.slice {
-            let axis = axis % 3;
-            if !(0.0..f64::from(extent[axis])).contains(&at) {
-                let last = extent[axis].saturating_sub(1);
-                let axis = AXES[axis];
-                return Err(OutsideError::Slice { axis, at, last });
+        if let Some(plane) = self.slice {
+            let half = self.slab_nm / 2.0;
+            match plane.axis() {
+                Some((axis, at)) => {
+                    let half = half / volume.voxel_nm[axis];
+                    let (from, to) = (at - half, at + half);
+                    let end = f64::from(extent[axis]);
+                    if !(from < end && to >= 0.0) {
+                        let last = extent[axis].saturating_sub(1);
+                        let axis = AXES[axis];
+                        return Err(OutsideError::Slice { axis, at, last });
+                    }
+                    (low[axis], high[axis]) = (from.max(0.0), to.min(end));
+                }
+                None if plane.offset(volume).abs() > plane.reach(volume) + half => {
+                    let away = plane.offset(volume).abs() - plane.reach(volume);
+                    return Err(OutsideError::Oblique { away });
+                }
+                None => {}
             }
-            (low[axis], high[axis]) = (at, at);
         }
         let Some([one, other]) = self.within else {
             return Ok(());
@@ -207,24 +287,25 @@ impl Shown {
     /// How samples become colours.
     pub fn drawn_mode(&self) -> Mode {
         match self.slice {
-            Some(_) => Mode::Maximum,
-            None => self.mode,
+            Some(_) if self.slab_nm == 0.0 => Mode::Maximum,
+            _ => self.mode,
         }
     }
 
     /// What is cut away of a volume.
     pub fn clip(&self, volume: &Volume) -> Clip {
         let point = |voxels: DVec3| Point::new(voxels * volume.voxel_nm);
-        let slab = self.slice.map(|slice| Slab {
-            point: point(DVec3::AXES[slice.axis % 3] * slice.at),
-            normal: DVec3::AXES[slice.axis % 3],
-            thickness_nm: 0.0,
-        });
         Clip {
             within: self.within.map(|corners| corners.map(point)),
-            slab,
-            ..Clip::default()
+            half_spaces: self.cuts.map(|cut| cut.map(|cut| cut.half_space(volume))),
+            slab: self.slice.map(|plane| plane.slab(self.slab_nm, volume)),
         }
+    }
+
+    /// Cuts along another plane; whether there was room for it.
+    pub fn cut(&mut self, plane: Plane) -> bool {
+        let free = self.cuts.iter_mut().find(|cut| cut.is_none());
+        free.map(|cut| *cut = Some(plane)).is_some()
     }
 }
 
@@ -233,13 +314,13 @@ mod tests {
     use glam::UVec3;
 
     use super::*;
+    use crate::plane::plane_from_text;
 
     #[test]
     fn text_names_what_is_shown() {
         assert_eq!(mode_from_text("maximum"), Ok(Mode::Maximum));
         let corners = [DVec3::new(1.0, 2.0, 3.0), DVec3::new(40.5, 0.0, 6.0)];
         assert_eq!(box_from_text("1,2, 3,40.5,0,6"), Ok(corners));
-        assert_eq!(slice_from_text("y=-7.5"), Ok(Slice { axis: 1, at: -7.5 }));
         assert_eq!(channels_from_text("0, 12"), Ok(vec![0, 12]));
         for bad in ["", "Maximum", "mip"] {
             assert!(mode_from_text(bad).is_err(), "{bad:?}");
@@ -254,8 +335,28 @@ mod tests {
         ] {
             assert!(box_from_text(bad).is_err(), "{bad:?}");
         }
-        for bad in ["", "z", "z=", "w=4", "z=NaN", "4"] {
-            assert!(slice_from_text(bad).is_err(), "{bad:?}");
+        let heat = |of, full| Ok(Heat { of, full });
+        assert_eq!(heat_from_text("nodes=40"), heat(Work::Nodes, 40.0));
+        assert_eq!(heat_from_text("samples"), heat(Work::Samples, 512.0));
+        for bad in ["", "node", "nodes=", "nodes=0", "nodes=NaN", "nodes=-1"] {
+            assert!(heat_from_text(bad).is_err(), "{bad:?}");
+        }
+        let chosen = |coarser| Detail::Chosen {
+            levels: 0..=u32::MAX,
+            coarser,
+        };
+        let each = vec![
+            (Some(0), Detail::Full),
+            (Some(3), chosen(2)),
+            (None, Detail::ByContent),
+        ];
+        assert_eq!(details_from_text("0:full, 3:2,content"), Ok(each));
+        for bad in ["", "fine", "a:full", "0:", "0:-1", "0:1:2", ","] {
+            assert!(details_from_text(bad).is_err(), "{bad:?}");
+        }
+        assert_eq!(thickness_from_text("40.5"), Ok(40.5));
+        for bad in ["", "-1", "NaN", "inf", "4nm"] {
+            assert!(thickness_from_text(bad).is_err(), "{bad:?}");
         }
         for bad in ["", "-1", "a", "1,,2", "1.5"] {
             assert!(channels_from_text(bad).is_err(), "{bad:?}");
@@ -267,7 +368,7 @@ mod tests {
         let volume = Volume::new("v", UVec3::new(90, 80, 70), DVec3::ONE).unwrap();
         let check = |slice: Option<&str>, within: Option<&str>| {
             let shown = Shown {
-                slice: slice.map(|text| slice_from_text(text).unwrap()),
+                slice: slice.map(|text| plane_from_text(text).unwrap()),
                 within: within.map(|text| box_from_text(text).unwrap()),
                 ..Shown::default()
             };
@@ -290,21 +391,42 @@ mod tests {
         for bad in ["90,0,0,99,80,70", "-9,0,0,0,80,70", "0,0,200,9,9,300"] {
             assert!(check(None, Some(bad)).is_err(), "{bad}");
         }
+        assert_eq!(check(Some("1,1,0@40,40,3"), None), Ok(()));
+        let told = check(Some("1,1,0@140,140,3"), None).unwrap_err();
+        assert!(told.contains("distance of 78 nm"), "{told}");
         assert_eq!(check(Some("z=5"), Some("0,0,5,9,9,9")), Ok(()));
         assert!(check(Some("z=4"), Some("0,0,5,9,9,9")).is_err());
     }
 
     #[test]
-    fn a_slice_is_a_plane_where_it_was_asked_for() {
+    fn a_plane_shows_values_and_a_slab_what_the_mode_says() {
         let volume = Volume::new("v", UVec3::new(90, 80, 70), DVec3::new(4.0, 4.0, 40.0)).unwrap();
-        let shown = Shown {
+        let mut shown = Shown {
             mode: Mode::IsoSurface,
-            within: None,
-            slice: Some(Slice { axis: 2, at: 30.5 }),
+            slice: Some(Plane::across(2, 30.5)),
+            ..Shown::default()
         };
         assert_eq!(shown.drawn_mode(), Mode::Maximum);
         let slab = shown.clip(&volume).slab.unwrap();
         assert_eq!((slab.point.xyz.z, slab.normal), (30.5 * 40.0, DVec3::Z));
+        shown.slab_nm = 200.0;
+        assert_eq!(shown.drawn_mode(), Mode::IsoSurface);
+        assert_eq!(shown.clip(&volume).slab.unwrap().thickness_nm, 200.0);
         assert_eq!(Shown::default().clip(&volume), Clip::default());
+    }
+
+    #[test]
+    fn four_planes_cut() {
+        let volume = Volume::new("v", UVec3::new(90, 80, 70), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+        let mut shown = Shown::default();
+        for at in 0..MOST_CUTS {
+            assert!(shown.cut(Plane::across(0, at as f64)));
+        }
+        assert!(!shown.cut(Plane::across(1, 7.0)), "no room");
+        let places = shown
+            .clip(&volume)
+            .half_spaces
+            .map(|h| h.unwrap().point.xyz.x);
+        assert_eq!(places, [0.0, 4.0, 8.0, 12.0]);
     }
 }

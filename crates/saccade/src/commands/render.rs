@@ -8,17 +8,26 @@ use clap::Args;
 use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{OpacityPoint, TransferFunction};
-use saccade_render::{Gpu, Mode, View};
-use saccade_stream::{Session, SessionOptions, SettleError, Status};
+use saccade_render::{Gpu, Heat, Mode, View};
+use saccade_stream::{Detail, Session, SessionOptions, SettleError, Status};
 use saccade_view::{
-    Shown, ShownError, Slice, background_from_text, box_from_text, channels_from_text,
-    mode_from_text, show_channels, slice_from_text,
+    MOST_CUTS, Plane, Shown, ShownError, background_from_text, box_from_text, channels_from_text,
+    details_from_text, heat_from_text, mode_from_text, plane_from_text, set_details, show_channels,
+    thickness_from_text,
 };
 
 use crate::arguments::{CatalogArgument, picture, picture_size, seconds};
 use crate::open::Place;
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
+
+/// How finely channels are drawn, in one argument.
+#[derive(Clone, Debug)]
+struct Details(Vec<(Option<u32>, Detail)>);
+
+fn details(text: &str) -> Result<Details, ShownError> {
+    details_from_text(text).map(Details)
+}
 
 /// A list of channels, in one argument.
 #[derive(Clone)]
@@ -82,10 +91,29 @@ pub(crate) struct Render {
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", value_parser = box_from_text, allow_hyphen_values = true)]
     clip: Option<[DVec3; 2]>,
 
-    /// Show one plane, as in z=40 [voxels of the finest level] [default: all
-    /// depths]
-    #[arg(long, value_name = "AXIS=VOXEL", value_parser = slice_from_text)]
-    slice: Option<Slice>,
+    /// Show one plane: across an axis, as in z=40, or with any normal and through any point, as in
+    /// 1,0.5,0@300,200,40 [voxels of the finest level; normals in nm] [default: all depths]
+    #[arg(long, value_name = "PLANE", value_parser = plane_from_text, allow_hyphen_values = true)]
+    slice: Option<Plane>,
+
+    /// With --slice, show what is around the plane as well, so thick in all [nm]; 0 is the plane alone
+    #[arg(long, value_name = "NM", value_parser = thickness_from_text, default_value = "0", requires = "slice")]
+    slab: f64,
+
+    /// Cut away what the normal of a plane does not point to; planes as with --slice, up to four times
+    /// [default: nothing]
+    #[arg(long, value_name = "PLANE", value_parser = plane_from_text, allow_hyphen_values = true)]
+    cut: Vec<Plane>,
+
+    /// Draw the work of rays, black, red, yellow, white: lookups (page table entries read), nodes (of the
+    /// residency octree) or samples, and how much is white, as in nodes=40 [default: the volume]
+    #[arg(long, value_name = "WORK[=FULL]", value_parser = heat_from_text)]
+    heat: Option<Heat>,
+
+    /// How finely channels are drawn: full, content (no level that differs by less than a hundredth from the next
+    /// coarser one), or levels coarser than the view asks for; for all channels, or each as in 0:full,3:2
+    #[arg(long, value_name = "DETAIL,...", value_parser = details, default_value = "full")]
+    detail: Details,
 
     /// Colours and opacities of the first channel shown: auto, a JSON file, or JSON itself
     #[arg(long, value_name = "JSON", default_value = "auto")]
@@ -130,11 +158,20 @@ impl Render {
             .await?;
         opened.tell_of_labels();
         let source = opened.source;
-        let shown = Shown {
+        let mut shown = Shown {
             mode: self.mode,
             within: self.clip,
             slice: self.slice,
+            slab_nm: self.slab,
+            heat: self.heat,
+            ..Shown::default()
         };
+        for plane in self.cut {
+            ensure!(
+                shown.cut(plane),
+                "{MOST_CUTS} planes can cut at once; give --cut fewer times"
+            );
+        }
         shown.check(source.volume())?;
         let gpu = Gpu::headless().await?;
         let gpu_bytes = u64::from(self.gpu_memory) << 20;
@@ -148,6 +185,8 @@ impl Render {
         let mut session = Session::new(&gpu, source, options)?;
         let channels = self.channels.as_ref().map(|Channels(list)| &list[..]);
         show_channels(&mut session, channels, transfer)?;
+        let Details(details) = &self.detail;
+        set_details(&mut session, details)?;
         if let Some(iso) = self.iso {
             for channel in (0..).take(session.channels().len()) {
                 session.set_iso(channel, Some(iso))?;
@@ -157,6 +196,7 @@ impl Render {
             background: self.background,
             mode: shown.drawn_mode(),
             clip: shown.clip(session.volume()),
+            heat: shown.heat,
             lod_bias: self.lod_bias,
             ..View::new(camera, self.size)
         };

@@ -454,7 +454,7 @@ fn no_gpu() {
 
 #[test]
 fn words_that_make_no_sense() {
-    let cases: [(&[&str], &[&str]); 14] = [
+    let cases: [(&[&str], &[&str]); 18] = [
         (
             &["simulate", "a", "--input", "b", "--extent", "9,9,9"],
             &["--extent", "cannot be used with", "--input"],
@@ -484,6 +484,19 @@ fn words_that_make_no_sense() {
             &["0,95,1,0,0,0"],
         ),
         (&["render", "a", "-o", "b", "--size", "12"], &["12", "WxH"]),
+        (
+            &["render", "a", "-o", "b", "--slice", "1,0@2,3,4"],
+            &["1,0@2,3,4", "z=40"],
+        ),
+        (&["render", "a", "-o", "b", "--slab", "40"], &["--slice"]),
+        (
+            &["render", "a", "-o", "b", "--heat", "nodes=0"],
+            &["nodes=0", "lookups"],
+        ),
+        (
+            &["render", "a", "-o", "b", "--detail", "fine"],
+            &["fine", "content"],
+        ),
         (
             &["render", "a", "-o", "b", "--background", "red"],
             &["red", "#rrggbb"],

@@ -73,6 +73,38 @@ fn from_tissue_to_picture() {
 }
 
 #[test]
+fn planes_slabs_cuts_and_the_work_of_rays_are_pictures_of_their_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let picture = folder.path().join("picture.png");
+    let Some(whole) = render(&archive, &picture, &[]) else {
+        return;
+    };
+    let of = |more: &[&str]| render(&archive, &picture, more).unwrap();
+    let pictures = [
+        whole,
+        of(&["--slice", "z=6"]),
+        of(&["--slice", "0.3,-1,0@300,250,6"]),
+        of(&["--slice", "z=6", "--slab", "160"]),
+        of(&["--cut", "-1,0,0@300,250,6"]),
+        of(&["--cut", "-1,0,0@300,250,6", "--cut", "y=250"]),
+        of(&["--heat", "samples=200"]),
+        of(&["--detail", "3"]),
+    ];
+    for (n, one) in pictures.iter().enumerate() {
+        for (m, other) in pictures.iter().enumerate().skip(n + 1) {
+            let apart = largest_difference(one, other);
+            assert!(apart > 20, "pictures {n} and {m} are alike: {apart}");
+        }
+    }
+    // Named in other words, they are the same.
+    let alike = largest_difference(&pictures[1], &of(&["--slice", "0,0,2@9,9,6"]));
+    assert!(alike <= ROUNDING, "{alike}");
+    let alike = largest_difference(&pictures[0], &of(&["--detail", "0:full"]));
+    assert!(alike <= ROUNDING, "{alike}");
+}
+
+#[test]
 fn what_is_not_complete_is_not_written_unless_wanted() {
     let folder = tempfile::tempdir().unwrap();
     let archive = archive(folder.path());
