@@ -87,9 +87,9 @@ impl PageOptions {
                 "slice" => page.view.shown.slice = Some(plane_from_text(&value)?),
                 "slab" => page.view.shown.slab_nm = thickness_from_text(&value)?,
                 "cut" => {
-                    if !page.view.shown.cut(plane_from_text(&value)?) {
-                        return Err(PageError::TooManyCuts { most: MOST_CUTS });
-                    }
+                    let fits = page.view.shown.cut(plane_from_text(&value)?);
+                    let most = MOST_CUTS;
+                    fits.then_some(()).ok_or(PageError::TooManyCuts { most })?;
                 }
                 "heat" => page.view.shown.heat = Some(heat_from_text(&value)?),
                 "background" => page.view.background = background_from_text(&value)?,

@@ -36,7 +36,7 @@ enum Command {
     Ingest(commands::ingest::Ingest),
     Serve(commands::serve::Serve),
     View(commands::view::View),
-    Render(commands::render::Render),
+    Render(Box<commands::render::Render>),
     Export(commands::export::Export),
     Check(commands::check::Check),
 }
