@@ -4,7 +4,7 @@ import { join } from 'node:path';
 import { after, before, beforeEach, test } from 'node:test';
 
 import { launch, open } from './lib/browser.mjs';
-import { serveFiles, writePrecomputed, writeZarr } from './lib/images.mjs';
+import { serveFiles, WINDOW, writePrecomputed, writeZarr } from './lib/images.mjs';
 import { covered, picture, psnr } from './lib/picture.mjs';
 import { folder, run, until } from './lib/saccade.mjs';
 
@@ -68,6 +68,23 @@ for (const name of ['em.zarr', 'sharded.zarr', 'em.precomputed']) {
     await page.context().close();
   });
 }
+
+test('an image is shown in the colours and the window that it asks for', async () => {
+  const { page } = await open(browser, SIZE);
+  const url = new URL(address('em.zarr'));
+  url.searchParams.delete('transfer');
+  await page.goto(url.href);
+  await settled(page);
+  const { transfer } = await status(page);
+  assert.equal(transfer.color_map, 'magenta');
+  assert.deepEqual(transfer.window.map((share) => Math.round(255 * share)), WINDOW);
+  const shown = await picture(await page.screenshot());
+  const sums = [0, 1, 2].map((c) => shown.data.reduce((sum, value, i) => (i % 4 === c ? sum + value : sum), 0));
+  assert.ok(sums[0] > 1e5 && Math.abs(sums[0] - sums[2]) < 0.02 * sums[0] && sums[1] < 0.02 * sums[0], `${sums}`);
+  const agreement = psnr(shown, await render(CAMERA, JSON.stringify(transfer)));
+  assert.ok(agreement >= AGREE_DB, `the pictures agree to ${agreement} dB only`);
+  await page.context().close();
+});
 
 test('a server that knows no ranges is slow, not wrong', async () => {
   images.rules.ranges = false;
@@ -187,9 +204,9 @@ async function settled(page, fidelity = 'complete') {
   }, 120);
 }
 
-async function render(camera) {
+async function render(camera, transfer = TRANSFER) {
   const out = join(work.path, 'render.png');
-  await run('render', join(work.path, 'em.zarr'), '--camera', camera, '--transfer', TRANSFER,
+  await run('render', join(work.path, 'em.zarr'), '--camera', camera, '--transfer', transfer,
     '--size', `${SIZE.width}x${SIZE.height}`, '-o', out);
   return picture(out);
 }

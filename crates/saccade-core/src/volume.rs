@@ -51,6 +51,20 @@ impl VoxelKind {
     }
 }
 
+/// How a channel is meant to be shown at first, as far as whoever wrote the volume says.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Look {
+    /// Colour of its large values, sRGB.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub color: Option<[u8; 3]>,
+    /// Values at the two ends of its colours, rising, `[0, 1]` of the value type's range.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub window: Option<[f32; 2]>,
+    /// Whether it is not seen.
+    pub hidden: bool,
+}
+
 /// A virtual 3D image: its shape is known, its voxels may not exist yet.
 ///
 /// Value 0 means "nothing was acquired here"; sources keep measured values at 1 or above. Among labels 0 is
@@ -66,6 +80,9 @@ pub struct Volume {
     pub kind: VoxelKind,
     /// Names of the channels; at least one.
     pub channels: Vec<String>,
+    /// How channels are meant to be shown at first, in their order; nothing is said of those that are missing here.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub looks: Vec<Look>,
     /// Voxel size at level 0 \[nm\].
     pub voxel_nm: DVec3,
     /// Levels, finest first; at least one.
@@ -152,10 +169,16 @@ impl Volume {
             dtype: Dtype::Uint8,
             kind: VoxelKind::Intensity,
             channels: vec!["intensity".to_owned()],
+            looks: Vec::new(),
             voxel_nm,
             levels: halving_levels(extent, voxel_nm),
             chunk: UVec3::new(64, 64, 32),
         })
+    }
+
+    /// How a channel is meant to be shown at first.
+    pub fn look(&self, channel: usize) -> Look {
+        self.looks.get(channel).copied().unwrap_or_default()
     }
 
     /// Size at level 0 \[voxels\].
@@ -250,8 +273,19 @@ mod tests {
 
     #[test]
     fn descriptions_survive_json() {
-        let v = Volume::new("v", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+        let mut v =
+            Volume::new("v", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap();
         let json = serde_json::to_string(&v).unwrap();
         assert_eq!(serde_json::from_str::<Volume>(&json).unwrap(), v);
+        assert!(!json.contains("looks"), "nothing is said: {json}");
+        let look = Look {
+            color: Some([1, 2, 3]),
+            window: Some([0.25, 0.5]),
+            hidden: true,
+        };
+        v.looks = vec![Look::default(), look];
+        let json = serde_json::to_string(&v).unwrap();
+        assert_eq!(serde_json::from_str::<Volume>(&json).unwrap(), v);
+        assert_eq!((v.look(1), v.look(2)), (look, Look::default()));
     }
 }

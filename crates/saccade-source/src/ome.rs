@@ -33,14 +33,23 @@ pub fn placed(volume: &Volume) -> Vec<Placed> {
     placed.collect()
 }
 
-/// The metadata of an image that holds some channels of a volume at some levels; `section` is the one to begin
-/// with. One of labels says so (`image-label`), and has no colours and windows (`omero`), which are for shades.
-pub fn image(volume: &Volume, channels: &[String], levels: &[Placed], section: u32) -> Value {
+/// All channels of a volume.
+pub fn channels(volume: &Volume) -> Vec<u32> {
+    (0..).take(volume.channels.len()).collect()
+}
+
+/// The metadata of an image that holds some channels of a volume, in this order, at some levels; `section` is the one
+/// to begin with. One of labels says so (`image-label`), and has no colours and windows (`omero`), which are for shades.
+///
+/// # Panics
+///
+/// If the volume has no such channel.
+pub fn image(volume: &Volume, channels: &[u32], levels: &[Placed], section: u32) -> Value {
     let multiscales = [multiscale(&volume.name, volume.kind, levels)];
     match volume.kind {
         VoxelKind::Intensity => json!({
             "multiscales": multiscales,
-            "omero": omero(channels, volume.dtype, section),
+            "omero": omero(volume, channels, section),
         }),
         VoxelKind::Labels => json!({ "multiscales": multiscales, "image-label": {} }),
     }
@@ -69,27 +78,36 @@ fn multiscale(name: &str, kind: VoxelKind, levels: &[Placed]) -> Value {
     })
 }
 
-/// How channels of these names are to be shown.
-fn omero(channels: &[String], dtype: Dtype, section: u32) -> Value {
-    let largest = match dtype {
+/// How these channels of a volume are to be shown, in this order.
+fn omero(volume: &Volume, channels: &[u32], section: u32) -> Value {
+    let largest = match volume.dtype {
         Dtype::Uint16 => u16::MAX,
         _ => u16::from(u8::MAX),
     };
     let several = channels.len() > 1;
-    let channel = |(index, label): (usize, &String)| {
-        let color = if several {
-            COLORS[index % COLORS.len()]
-        } else {
-            "FFFFFF"
+    let channel = |(index, channel): (usize, &u32)| {
+        let of = *channel as usize;
+        let look = volume.look(of);
+        let color = match look.color {
+            Some([r, g, b]) => format!("{r:02X}{g:02X}{b:02X}"),
+            None if several => COLORS[index % COLORS.len()].to_owned(),
+            None => "FFFFFF".to_owned(),
         };
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "from 0 to the largest value"
+        )]
+        let end = |share: f32| (f64::from(share) * f64::from(largest)).round() as u16;
+        let [start, end] = look.window.unwrap_or([0.0, 1.0]).map(end);
         json!({
-            "active": true,
+            "active": !look.hidden,
             "coefficient": 1,
             "color": color,
             "family": "linear",
             "inverted": false,
-            "label": label,
-            "window": { "min": 0, "max": largest, "start": 0, "end": largest },
+            "label": volume.channels[of],
+            "window": { "min": 0, "max": largest, "start": start, "end": end },
         })
     };
     let model = if several { "color" } else { "greyscale" };
@@ -107,6 +125,7 @@ fn czyx(c: f64, xyz: DVec3) -> [f64; 4] {
 mod tests {
     use super::*;
     use glam::UVec3;
+    use saccade_core::volume::Look;
 
     fn volume() -> Volume {
         Volume::new("em", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap()
@@ -137,18 +156,36 @@ mod tests {
 
     #[test]
     fn several_channels_are_told_apart() {
-        let omero = omero(&["DAPI".into(), "GFP".into()], Dtype::Uint8, 0);
-        let [a, b] = &omero["channels"].as_array().unwrap()[..] else {
-            panic!("{omero}")
+        let mut volume = volume();
+        volume.channels = ["SE", "DAPI", "GFP"].map(String::from).to_vec();
+        let omero = |volume: &Volume| omero(volume, &[1, 2], 0);
+        let plain = omero(&volume);
+        let [a, b] = &plain["channels"].as_array().unwrap()[..] else {
+            panic!("{plain}")
         };
         assert_eq!((&a["label"], &b["label"]), (&json!("DAPI"), &json!("GFP")));
         assert_ne!(a["color"], b["color"]);
+        let look = Look {
+            color: Some([1, 171, 0]),
+            window: Some([0.2, 0.4]),
+            hidden: true,
+        };
+        volume.looks = vec![Look::default(), Look::default(), look];
+        let told = omero(&volume);
+        assert_eq!(&told["channels"][0], a);
+        let b = &told["channels"][1];
+        assert_eq!(
+            (&b["color"], &b["active"]),
+            (&json!("01AB00"), &json!(false))
+        );
+        let window = json!({ "min": 0, "max": 255, "start": 51, "end": 102 });
+        assert_eq!(b["window"], window);
     }
 
     #[test]
     fn labels_are_said_to_be_labels() {
         let mut volume = volume();
-        let said = |volume: &Volume| image(volume, &volume.channels, &placed(volume), 0);
+        let said = |volume: &Volume| image(volume, &channels(volume), &placed(volume), 0);
         let shades = said(&volume);
         assert_eq!(shades["multiscales"][0]["type"], "mean");
         assert!(shades["omero"].is_object() && shades.get("image-label").is_none());

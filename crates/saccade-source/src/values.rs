@@ -141,8 +141,7 @@ impl Values {
         }
     }
 
-    #[cfg(test)]
-    /// Where a value of the volume comes from, as a line: what 0 and 65535 of what is shown stand for.
+    /// Where a value of the volume comes from, as a line: the number times the first plus the second. Means nothing of names.
     pub(crate) fn scale(&self) -> (f64, f64) {
         match (self.way, self.number) {
             (Way::Kept, Number::I8) => (1.0, 128.0),
@@ -154,6 +153,11 @@ impl Values {
                 (factor, 1.0 - min * factor)
             }
         }
+    }
+
+    /// Whether only sameness of values means anything.
+    pub(crate) fn are_names(&self) -> bool {
+        self.way == Way::Scattered
     }
 
     /// What the user should know, if anything.

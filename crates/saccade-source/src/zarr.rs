@@ -26,6 +26,7 @@
 mod array;
 mod error;
 mod image;
+mod looks;
 mod metadata;
 mod packing;
 mod shard;

@@ -6,8 +6,10 @@ use saccade_render::ChannelView;
 
 use crate::detail::Detail;
 
-/// Channels shown at first, of a volume that has more.
+/// Channels shown at first, of a volume that has more and does not say which.
 const SHOWN_AT_FIRST: usize = 4;
+/// Channels shown at first at most, where the volume says which.
+const MOST_AT_FIRST: usize = 16;
 
 /// How a channel is shown.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,8 +42,30 @@ impl Channel {
         self.iso.unwrap_or(middle)
     }
 
-    /// Colours and opacities that suit the histogram, for channel `index` of `volume`.
+    /// Colours and opacities for channel `index` of `volume`: as the volume says, and else as suits the histogram.
     fn suggested(&self, volume: &Volume, index: usize) -> TransferFunction {
+        let mut transfer = self.suiting(volume, index);
+        let look = volume.look(index);
+        if let Some(color) = look.color {
+            transfer.color_map = ColorMap::to_color(color);
+        }
+        if let Some([low, high]) = look.window {
+            transfer.window = [low, high];
+            // Whoever chose the window for sections chose no opacity: what is bright in it is opaque, and what the
+            // histogram takes for background stays transparent.
+            if transfer.polarity == Polarity::Bright
+                && let [first, last] = &mut transfer.opacity[..]
+            {
+                let most = low + 0.875 * (high - low);
+                first.value = first.value.clamp(low, most);
+                last.value = high;
+            }
+        }
+        transfer
+    }
+
+    /// Colours and opacities that suit the histogram.
+    fn suiting(&self, volume: &Volume, index: usize) -> TransferFunction {
         let size_nm = volume.size_nm();
         if volume.channels.len() == 1 {
             return self.histogram.transfer_function(size_nm);
@@ -65,11 +89,12 @@ impl Channel {
 
 /// All channels of a volume as they are shown at first.
 pub(crate) fn of_volume(volume: &Volume) -> Vec<Channel> {
+    let seen = shown_at_first(volume);
     let channel = |(index, name): (usize, &String)| {
         let histogram = Histogram::new(volume.dtype);
         let mut channel = Channel {
             name: name.clone(),
-            visible: index < SHOWN_AT_FIRST,
+            visible: seen.contains(&index),
             transfer: histogram.transfer_function(volume.size_nm()),
             histogram,
             automatic: true,
@@ -81,6 +106,19 @@ pub(crate) fn of_volume(volume: &Volume) -> Vec<Channel> {
         channel
     };
     volume.channels.iter().enumerate().map(channel).collect()
+}
+
+/// Channels that are shown at first: those that the volume does not hide, or the first few of them.
+fn shown_at_first(volume: &Volume) -> Vec<usize> {
+    let open = (0..volume.channels.len()).filter(|index| !volume.look(*index).hidden);
+    let open: Vec<usize> = open.collect();
+    let chosen = open.len() < volume.channels.len() && open.len() <= MOST_AT_FIRST;
+    let most = if chosen {
+        MOST_AT_FIRST
+    } else {
+        SHOWN_AT_FIRST
+    };
+    open.into_iter().take(most).collect()
 }
 
 /// Those that are seen, as renderers take them.
@@ -106,6 +144,7 @@ pub(crate) fn views(channels: &[Channel]) -> Vec<ChannelView> {
 #[cfg(test)]
 mod tests {
     use glam::{DVec3, UVec3};
+    use saccade_core::volume::Look;
 
     use super::*;
 
@@ -134,6 +173,44 @@ mod tests {
         );
         let single = of_volume(&volume(1));
         assert_eq!(single[0].transfer.color_map, ColorMap::Gray);
+    }
+
+    #[test]
+    fn what_the_volume_says_of_a_channel_is_kept_while_the_histogram_changes() {
+        let look = |color, window, hidden| Look {
+            color,
+            window,
+            hidden,
+        };
+        let mut volume = volume(6);
+        volume.looks = vec![
+            look(Some([255, 128, 0]), Some([0.25, 0.5]), false),
+            look(Some([0, 0, 255]), None, true),
+        ];
+        let mut channels = of_volume(&volume);
+        let seen: Vec<u32> = views(&channels).iter().map(|view| view.channel).collect();
+        assert_eq!(seen, [0, 2, 3, 4, 5], "all but what is hidden");
+        assert_eq!(channels[1].transfer.color_map, ColorMap::Color([0, 0, 255]));
+        assert_eq!(channels[2].transfer.color_map, ColorMap::of_channel(2));
+        // Background at 10, signal at 100 of 255.
+        channels[0].histogram.add(&[10; 900]);
+        channels[0].histogram.add(&[100; 90]);
+        channels[0].follow_histogram(&volume, 0);
+        let transfer = &channels[0].transfer;
+        assert_eq!(transfer.color_map, ColorMap::Color([255, 128, 0]));
+        assert_eq!(transfer.window, [0.25, 0.5]);
+        assert_eq!(transfer.opacity_at(0.2), 0.0);
+        assert!(transfer.opacity_at(0.4) > 0.3 && transfer.opacity_at(0.5) > 0.8);
+        // Background that reaches into the window stays transparent as well.
+        channels[0].histogram.add(&[90; 5000]);
+        channels[0].follow_histogram(&volume, 0);
+        assert_eq!(channels[0].transfer.opacity_at(0.34), 0.0);
+        assert!(channels[0].transfer.opacity_at(0.5) > 0.8);
+        let mut single = volume.clone();
+        single.channels.truncate(1);
+        single.looks.truncate(1);
+        let channel = of_volume(&single).remove(0);
+        assert_eq!(channel.transfer.window, [0.25, 0.5]);
     }
 
     #[test]

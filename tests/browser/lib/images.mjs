@@ -10,6 +10,8 @@ import { grayPng } from './picture.mjs';
 const SIZE = [93, 70, 51];
 const CHUNK = 32;
 const VOXEL_NM = [10, 10, 20];
+/** Values at the ends of the colours that the OME-Zarr image asks for. */
+export const WINDOW = [40, 220];
 
 /** A bright shell and a bright core in the dark, with stripes that tell x, y and z apart. */
 function value(x, y, z) {
@@ -64,7 +66,9 @@ export async function writeZarr(folder) {
     }
   }
   await write(join(folder, '.zgroup'), { zarr_format: 2 });
-  await write(join(folder, '.zattrs'), { multiscales: [{ version: '0.4', axes, datasets }] });
+  const [start, end] = WINDOW;
+  const channels = [{ label: 'shell', color: 'FF00FF', active: true, window: { min: 0, max: 255, start, end } }];
+  await write(join(folder, '.zattrs'), { multiscales: [{ version: '0.4', axes, datasets }], omero: { channels } });
 }
 
 /** Neuroglancer precomputed: chunks of 32 x 32 x 32 as PNG, each a file of its own, those at the ends cut. */

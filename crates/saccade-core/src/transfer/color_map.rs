@@ -102,6 +102,14 @@ impl ColorMap {
         Self::Blue,
     ];
 
+    /// From black to a colour, sRGB, by its name if it has one.
+    pub fn to_color(color: [u8; 3]) -> Self {
+        let named = Self::ALL.into_iter();
+        let mut named =
+            named.filter(|map| matches!(map.corners(), [[0, 0, 0], last] if *last == color));
+        named.next().unwrap_or(Self::Color(color))
+    }
+
     /// Maps of one hue each, for the first channel, the second, and so on, again from the start.
     pub fn of_channel(channel: u32) -> Self {
         const HUES: [ColorMap; 7] = [
@@ -204,6 +212,12 @@ mod tests {
         assert_eq!(orange.srgb(0.0), [0.0; 3]);
         assert_eq!(orange.srgb(0.5), [0.5, 0.2, 0.0]);
         assert_eq!(ColorMap::Color([255; 3]).srgb(0.3), [0.3; 3]);
+        assert_eq!(ColorMap::to_color([255; 3]), ColorMap::Gray);
+        assert_eq!(ColorMap::to_color([255, 0, 255]), ColorMap::Magenta);
+        assert_eq!(
+            ColorMap::to_color([255, 0, 0]),
+            ColorMap::Color([255, 0, 0])
+        );
     }
 
     #[test]

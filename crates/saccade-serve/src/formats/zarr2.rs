@@ -46,7 +46,8 @@ pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
 
 fn group(volume: &Volume) -> Value {
     let section = volume.extent().z / 2;
-    let mut image = ome::image(volume, &volume.channels, &ome::placed(volume), section);
+    let (channels, levels) = (ome::channels(volume), ome::placed(volume));
+    let mut image = ome::image(volume, &channels, &levels, section);
     image["multiscales"][0]["version"] = VERSION.into();
     for part in ["omero", "image-label"] {
         if let Some(part) = image.get_mut(part) {

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 /// Jobs that a worker has: one that it does, and one that it need not wait for.
 const IN_HAND: usize = 2;
-/// Workers that may break down before any did anything.
+/// Workers that may break down, one after the other, before they are ready to work.
 const STILLBORN: u32 = 3;
 
 /// Something to be done.
@@ -27,7 +27,9 @@ pub(super) struct Pool<J> {
     waiting: VecDeque<Task<J>>,
     /// What each has in hand, in the order in which it does it.
     workers: Vec<VecDeque<Task<J>>>,
-    /// How many broke down since one last did anything, if one ever did: else since the beginning.
+    /// Which of them were seen to work.
+    ready: Vec<bool>,
+    /// How many broke down before they were, since one last was.
     stillborn: u32,
     dropped: u64,
 }
@@ -38,6 +40,7 @@ impl<J: Job> Pool<J> {
             next: 0,
             waiting: VecDeque::new(),
             workers: (0..workers.max(1)).map(|_| VecDeque::new()).collect(),
+            ready: vec![false; workers.max(1)],
             stillborn: 0,
             dropped: 0,
         }
@@ -69,23 +72,27 @@ impl<J: Job> Pool<J> {
     }
 
     /// A worker shows that it works.
-    pub(super) fn works(&mut self) {
-        self.stillborn = 0;
+    pub(super) fn works(&mut self, worker: usize) {
+        if let Some(ready) = self.ready.get_mut(worker) {
+            *ready = true;
+            self.stillborn = 0;
+        }
     }
 
     /// A worker has done a job; `None` if it was not given that one.
     pub(super) fn done(&mut self, worker: usize, number: u32) -> Option<J> {
         let hand = self.workers.get_mut(worker)?;
         let at = hand.iter().position(|task| task.number == number)?;
-        self.stillborn = 0;
         hand.remove(at).map(|task| task.job)
     }
 
     /// A worker broke down, and another takes its place. What it had in hand is given to the next; a job at which a
     /// second one broke down is returned.
     pub(super) fn broke(&mut self, worker: usize) -> Option<J> {
-        self.stillborn += 1;
         let mut hand = std::mem::take(self.workers.get_mut(worker)?);
+        if !std::mem::replace(&mut self.ready[worker], false) {
+            self.stillborn += 1;
+        }
         let culprit = match hand.front_mut() {
             Some(first) if first.broke_one => hand.pop_front().map(|task| task.job),
             Some(first) => {
@@ -100,7 +107,7 @@ impl<J: Job> Pool<J> {
         culprit
     }
 
-    /// Whether workers break down before they do anything: then nobody should wait for them.
+    /// Whether workers break down before they are ready: then nobody should wait for them.
     pub(super) fn is_hopeless(&self) -> bool {
         self.stillborn >= STILLBORN
     }
@@ -187,16 +194,17 @@ mod tests {
         assert!(!pool.is_hopeless());
         assert_eq!(posted(&mut pool), [(0, 1), (0, 2)], "nobody else is blamed");
         assert!(pool.broke(0).is_none());
-        assert!(pool.is_hopeless(), "none ever did anything");
+        assert!(pool.is_hopeless(), "none was ever ready");
         let left: Vec<u32> = pool.take_all().iter().map(|job| job.0).collect();
         assert_eq!(left, [1, 2]);
         let mut pool = Pool::new(1);
         for round in 0..20 {
-            pool.works();
             pool.submit(job(round).0);
+            pool.works(0);
             assert!(pool.next().is_some() && pool.broke(0).is_none());
+            pool.works(0);
             assert!(pool.next().is_some() && pool.broke(0).is_some());
-            assert!(!pool.is_hopeless());
+            assert!(!pool.is_hopeless(), "chunks break workers that are well");
         }
     }
 

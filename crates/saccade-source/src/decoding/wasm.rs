@@ -265,7 +265,7 @@ fn go_on() {
 fn take_answer(place: usize, answer: &Array) {
     let number = answer.get(0).as_f64();
     let Some(number) = number else {
-        with_crew(|crew| crew.pool.works());
+        with_crew(|crew| crew.pool.works(place));
         return;
     };
     #[expect(
@@ -284,6 +284,7 @@ fn take_answer(place: usize, answer: &Array) {
     };
     let order = with_crew(|crew| {
         crew.hands[place].idle_looks = 0;
+        crew.pool.works(place);
         crew.pool.done(place, number)
     });
     if let Some(order) = order.flatten() {
@@ -316,9 +317,7 @@ fn replace(place: usize, why: &str) {
     match gone {
         None => go_on(),
         Some(mut crew) => {
-            log::warn!(
-                "workers break down before they decode anything, so that the page itself decodes"
-            );
+            log::warn!("workers break down before they are ready, so that the page itself decodes");
             count(|counts| counts.dropped += crew.pool.dropped());
             // Whoever waits sees that nobody will answer.
             drop(crew.pool.take_all());

@@ -176,11 +176,8 @@ impl Plan {
             }
         });
         let levels: Vec<_> = levels.collect();
-        let names = self.channels.iter();
-        let names = names.map(|channel| self.volume.channels[*channel as usize].clone());
         let section = self.levels[0].voxels.size().z / 2;
-        let names = names.collect::<Vec<_>>();
-        let mut image = ome::image(&self.volume, &names, &levels, section);
+        let mut image = ome::image(&self.volume, &self.channels, &levels, section);
         image["version"] = "0.5".into();
         json!({
             "zarr_format": 3,

@@ -12,6 +12,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::array::Array;
 use super::error::{Refusal, ZarrError};
+use super::looks::looks;
 use super::metadata::{Axis, Image};
 use super::packing::Packing;
 use super::shard::Index;
@@ -223,6 +224,14 @@ impl ZarrImage {
                 sample.values(number, big_endian, metadata.is_labels, declared)
             }
         });
+        let (count, dtype) = (image.volume.channels.len(), image.volume.dtype);
+        let looks = looks(&metadata.channels, count, &image.values, dtype);
+        if !metadata.is_labels && !looks.is_empty() {
+            image.volume = Arc::new(Volume {
+                looks,
+                ..(*image.volume).clone()
+            });
+        }
         Ok(image)
     }
 

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use proptest::prelude::*;
-use saccade_core::volume::Dtype;
+use saccade_core::volume::{Dtype, Look};
 use serde_json::json;
 
 use saccade_core::voxel_box::VoxelBox;
@@ -492,6 +492,15 @@ fn two_versions_of_a_real_image_agree() {
     let (old, new) = (open(&old).unwrap(), open(&new).unwrap());
     assert_eq!(old.volume().channels, ["LaminB1", "Dapi"]);
     assert_eq!(old.volume().channels, new.volume().channels);
+    let end = 1500.0 / 65_535.0;
+    for volume in [old.volume(), new.volume()] {
+        let looks = [[0, 0, 255], [255, 255, 0]].map(|color| Look {
+            color: Some(color),
+            window: Some([0.0, end]),
+            hidden: false,
+        });
+        assert_eq!(volume.looks, looks);
+    }
     assert_eq!(old.volume().extent(), UVec3::new(271, 275, 236));
     assert_eq!(old.volume().levels.len(), 3);
     let voxel = |source: &ZarrSource, channel: u32, at: UVec3| -> u16 {
