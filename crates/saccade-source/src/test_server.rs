@@ -51,6 +51,8 @@ pub(crate) struct TestServer {
     pub(crate) log: Mutex<Vec<(String, Option<String>)>>,
     /// What is said of objects that there are not.
     pub(crate) missing: Mutex<&'static str>,
+    /// Tag of every object, if they have any.
+    pub(crate) tag: Mutex<Option<&'static str>>,
     /// Every answer waits so long.
     pub(crate) latency: Mutex<Duration>,
     /// Requests that are being answered, and the most there ever were.
@@ -70,6 +72,7 @@ impl TestServer {
             always: Mutex::default(),
             log: Mutex::default(),
             missing: Mutex::new("404 Not Found"),
+            tag: Mutex::default(),
             latency: Mutex::default(),
             busy: AtomicUsize::new(0),
             busiest: AtomicUsize::new(0),
@@ -195,6 +198,9 @@ impl TestServer {
             }
             _ => ("200 OK".to_owned(), object),
         };
+        if let Some(tag) = *self.tag.lock().unwrap() {
+            head += &format!("\r\netag: {tag}");
+        }
         match fault {
             None | Some(Fault::Whole | Fault::Status(_)) => {}
             Some(Fault::Reset) => {

@@ -39,6 +39,12 @@ pub enum ObjectError {
         /// File or address.
         location: String,
     },
+    /// Parts of it were read, and now there is another object in its place.
+    #[error("it was replaced while it was read; open the image again: {location}")]
+    Replaced {
+        /// Address.
+        location: String,
+    },
     /// The object is longer than it may be.
     #[error("it has more than {most} bytes, which is more than it can need: {location}")]
     TooLong {

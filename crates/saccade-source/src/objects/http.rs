@@ -13,6 +13,8 @@ mod tests;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytes::Bytes;
+use quick_cache::sync::Cache;
+use reqwest::header::{HeaderMap, HeaderValue};
 use reqwest::{Client, StatusCode, Url, header};
 use tokio::sync::{OnceCell, Semaphore};
 
@@ -22,6 +24,8 @@ use crate::maybe_send::BoxFuture;
 
 /// Requests under way at once; more wait here, first come, first served.
 const REQUESTS: usize = 24;
+/// Objects read in parts whose tags are remembered.
+const TAGS: usize = 1 << 14;
 /// Names an object that nobody has: see [`HttpObjects`].
 const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
 
@@ -33,6 +37,9 @@ const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
 /// whatever it does not have, as S3 does to those who may not list: with the first 403 it is asked for an
 /// object that nobody can have. 429, 5xx, broken connections, cut and stalled answers are asked for
 /// again, see [`Patience`]. A server that ignores ranges is put up with, and told of.
+///
+/// Parts of an object belong together: where the server tags what it sends (`ETag`) and a part has another tag than the one before,
+/// the object was replaced in between, which is an error. Browsers show tags only where the server exposes them.
 ///
 /// Natively, redirections to other hosts are not followed: whoever runs a store cannot make this computer ask others.
 ///
@@ -50,6 +57,8 @@ pub struct HttpObjects {
     suffixes: bool,
     /// Whether any answer could be read so far.
     heard: AtomicBool,
+    /// Tags of objects that were read in parts, by address.
+    tags: Cache<Url, HeaderValue>,
     requests: Semaphore,
     /// Whether missing objects are forbidden here, once it was asked.
     forbids_missing: OnceCell<bool>,
@@ -83,6 +92,7 @@ impl HttpObjects {
             patience,
             suffixes: platform::SUFFIXES,
             heard: AtomicBool::new(false),
+            tags: Cache::new(TAGS),
             requests: Semaphore::new(REQUESTS),
             forbids_missing: OnceCell::new(),
         })
@@ -190,6 +200,26 @@ impl HttpObjects {
         }
     }
 
+    /// Whether a part is of the same object as the parts before, as far as tags tell.
+    fn is_the_same(&self, url: &Url, part: &Part, of: &HeaderMap) -> Result<(), Failure> {
+        let tag = of.get(header::ETAG);
+        // Weak tags are of what is as good, not of the same bytes.
+        let tag = tag.filter(|tag| !tag.as_bytes().starts_with(b"W/"));
+        let (Some(tag), false) = (tag, matches!(part, Part::Whole { .. })) else {
+            return Ok(());
+        };
+        match self.tags.get(url) {
+            Some(before) if before == tag => Ok(()),
+            Some(_) => Err(Failure::Final(ObjectError::Replaced {
+                location: shown(url),
+            })),
+            None => {
+                self.tags.insert(url.clone(), tag.clone());
+                Ok(())
+            }
+        }
+    }
+
     async fn attempt(&self, url: &Url, part: &Part) -> Result<Found, Failure> {
         // The semaphore is never closed.
         let _permit = self.requests.acquire().await.ok();
@@ -208,6 +238,7 @@ impl HttpObjects {
         let status = answer.status();
         match status {
             StatusCode::OK | StatusCode::PARTIAL_CONTENT => {
+                self.is_the_same(url, part, answer.headers())?;
                 let bytes = answer::read(answer, part, self.patience, &shown(url)).await?;
                 Ok(Found::Object(bytes))
             }

@@ -197,6 +197,34 @@ async fn requests_are_limited_and_end_with_their_readers() {
     panic!("the connection is still open");
 }
 
+/// A shard whose index is of one file and whose chunks are of another is no shard.
+#[tokio::test]
+async fn parts_are_of_one_object_as_far_as_the_server_tells() {
+    let server = TestServer::start(conformance::objects()).await;
+    let store = of(&server);
+    let tagged = |tag| *server.tag.lock().unwrap() = tag;
+    tagged(Some("\"one\""));
+    store.read("a/b/ten", Part::Last(3)).await.unwrap();
+    ten(&store).await.unwrap();
+    tagged(Some("\"two\""));
+    let error = ten(&store).await.unwrap_err();
+    let named = error.to_string();
+    assert!(matches!(error, ObjectError::Replaced { .. }) && !error.is_transient());
+    assert!(
+        named.contains("a/b/ten") && named.contains("open the image again"),
+        "{named}"
+    );
+    let others = store.read("c/long", Part::Range(0..4)).await;
+    assert!(others.is_ok(), "tags are each object's own: {others:?}");
+    let whole = store.read("a/b/ten", Part::Whole { most: 10 }).await;
+    assert!(whole.is_ok(), "all of it is of one object: {whole:?}");
+    ten(&of(&server)).await.unwrap();
+    for nothing_told in [None, Some("W/\"three\"")] {
+        tagged(nothing_told);
+        assert!(ten(&store).await.is_ok(), "{nothing_told:?}");
+    }
+}
+
 #[tokio::test]
 async fn s3_waits_for_what_passes() {
     let server = TestServer::start(conformance::objects()).await;
