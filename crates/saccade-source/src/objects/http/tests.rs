@@ -227,17 +227,24 @@ async fn parts_are_of_one_object_as_far_as_the_server_tells() {
 
 #[tokio::test]
 async fn s3_waits_for_what_passes() {
-    let server = TestServer::start(conformance::objects()).await;
+    let named = ("c/416/ten".to_owned(), Bytes::from_static(b"0123456789"));
+    let objects = conformance::objects().into_iter().chain([named]);
+    let server = TestServer::start(objects).await;
     for fault in [
         Fault::Status("503 Slow Down"),
         Fault::Status("500 Oops"),
         Fault::Reset,
         Fault::Cut,
     ] {
-        server.fail_next([fault, fault]);
-        let got = ten(&s3_of(&server)).await;
-        assert_eq!(got.unwrap().as_deref(), Some(&b"234567"[..]), "{fault:?}");
+        // A number in an address is no answer.
+        for key in ["a/b/ten", "c/416/ten"] {
+            server.fail_next([fault, fault]);
+            let got = s3_of(&server).read(key, Part::Range(2..8)).await;
+            assert_eq!(got.unwrap().as_deref(), Some(&b"234567"[..]), "{fault:?}");
+        }
     }
+    let beyond = s3_of(&server).read("a/b/ten", Part::Range(5..11)).await;
+    assert!(matches!(beyond, Err(ObjectError::TooShort { .. })));
 }
 
 #[test]
