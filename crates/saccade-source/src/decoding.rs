@@ -103,8 +103,10 @@ mod tests {
             Bytes::from(zip.finish().unwrap())
         };
         let packing = zarr::Packing::new(vec![crate::codecs::Codec::Gzip], stored.len());
-        for names in [false, true] {
-            let values = Arc::new(Values::fitted(Number::F32, true, Some(window), names));
+        let shades = Values::fitted(Number::F32, true, Some(window));
+        let names = Values::names(Number::U32, true).unwrap();
+        for values in [shades, names] {
+            let values = Arc::new(values);
             for values in [None, Some(&values)] {
                 let here = Decoding::new(Packing::Zarr(packing.clone()), values);
                 let text = here.to_text().unwrap();

@@ -28,6 +28,16 @@ pub enum ImageError {
     /// A precomputed volume that cannot be opened.
     #[error(transparent)]
     Precomputed(#[from] PrecomputedError),
+    /// Whatever was asked for was forbidden.
+    #[error(
+        "whether there is an image is not known, as access to all of it is denied; {advice}: {location}"
+    )]
+    Denied {
+        /// How to mend it.
+        advice: &'static str,
+        /// Folder or address.
+        location: String,
+    },
     /// There is no image of a format that is known.
     #[error(
         "there is no image that can be opened: neither OME-Zarr (zarr.json, .zattrs) nor precomputed (info): {location}"
@@ -42,7 +52,7 @@ pub enum ImageError {
 ///
 /// # Errors
 ///
-/// [`ImageError::None`] if there is none, others if there is one that cannot be opened.
+/// [`ImageError::None`] if there is none, [`ImageError::Denied`] if nothing may be read there, others if there is one that cannot be opened.
 pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
     let (objects, name) = (location.objects()?, location.name());
     match ZarrSource::open(objects.clone(), &name).await {
@@ -54,15 +64,19 @@ pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
         Err(ZarrError::NoImage { .. }) => {}
         Err(error) => return Err(error.into()),
     }
-    match PrecomputedSource::open(objects, &name).await {
+    match PrecomputedSource::open(objects.clone(), &name).await {
         Ok(source) => {
             let notes = source.notes().to_vec();
             let source = Arc::new(source);
             Ok(OpenImage { source, notes })
         }
-        Err(PrecomputedError::NoVolume { .. }) => Err(ImageError::None {
-            location: location.to_string(),
-        }),
+        Err(PrecomputedError::NoVolume { .. }) => {
+            let location = location.to_string();
+            Err(match objects.denied() {
+                Some(advice) => ImageError::Denied { advice, location },
+                None => ImageError::None { location },
+            })
+        }
         Err(error) => Err(error.into()),
     }
 }

@@ -62,6 +62,17 @@ pub trait Objects: MaybeSend + MaybeSync + fmt::Debug {
     /// Where an object is, for messages.
     fn location(&self, key: &str) -> String;
 
+    /// Names of the folders that they lie in, outermost first, the last their own: formats have places. Empty where there
+    /// are none.
+    fn folders(&self) -> Vec<String> {
+        Vec::new()
+    }
+
+    /// How to mend it, if all that was asked for so far was forbidden: then nothing is known of what is there.
+    fn denied(&self) -> Option<&'static str> {
+        None
+    }
+
     /// What beginning another read takes, as bytes that could have been read meanwhile: parts of an
     /// object that lie closer together are better read as one.
     fn read_cost(&self) -> u64;

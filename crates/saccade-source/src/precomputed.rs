@@ -6,9 +6,9 @@
 //!
 //! # Values
 //!
-//! As those of [`crate::zarr`]. Segments whose ids fit into 16 bit keep them; others are scattered over 65535
-//! numbers, which [`PrecomputedSource::notes`] tells: 0 stays nothing, the same id the same number everywhere. A volume
-//! of type `segmentation` is one of labels.
+//! As those of [`crate::zarr`]. A volume of type `segmentation` is one of labels: ids that fit into 16 bit stay what they
+//! are, others are scattered over 65535 numbers, which [`PrecomputedSource::notes`] tells: 0 stays nothing, the same id the
+//! same number everywhere.
 //!
 //! # Failure
 //!

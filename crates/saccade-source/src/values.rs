@@ -85,8 +85,8 @@ enum Way {
     Less(i64),
     /// From this window to 1 to 65535.
     Window(Spread),
-    /// Names of things, of which only sameness matters, scattered over 1 to 65535.
-    Scattered,
+    /// Names of things, of which only sameness matters: what they are up to 65535, scattered over 1 to 65535 beyond.
+    Names,
 }
 
 /// To values of a volume, from stored numbers. 0 stays, or becomes, "nothing measured" where it is the least.
@@ -105,13 +105,13 @@ impl Values {
         (number.bytes() <= 2).then(|| Self::new(number, big_endian, Way::Kept))
     }
 
-    /// Those of wide numbers, of which a sample has this spread. `names` says that they name things.
-    pub(crate) fn fitted(
-        number: Number,
-        big_endian: bool,
-        spread: Option<Spread>,
-        names: bool,
-    ) -> Self {
+    /// Those of numbers that name things: the same whatever some of them are. `None` for numbers that cannot.
+    pub(crate) fn names(number: Number, big_endian: bool) -> Option<Self> {
+        { number.is_whole() }.then(|| Self::new(number, big_endian, Way::Names))
+    }
+
+    /// Those of wide numbers, of which a sample has this spread.
+    pub(crate) fn fitted(number: Number, big_endian: bool, spread: Option<Spread>) -> Self {
         let spread = spread.unwrap_or(Spread { min: 0.0, max: 1.0 });
         let Spread { min, max } = spread;
         let way = if !number.is_whole() {
@@ -119,8 +119,6 @@ impl Values {
             Way::Window(Spread { min, max })
         } else if min >= 0.0 && max <= f64::from(u16::MAX) {
             Way::Less(0)
-        } else if names {
-            Way::Scattered
         } else if max - min < f64::from(u16::MAX) && min.abs() < 2_f64.powi(52) {
             // Whole, and below 2^52.
             #[expect(clippy::cast_possible_truncation, reason = "checked in the line above")]
@@ -146,7 +144,7 @@ impl Values {
         match (self.way, self.number) {
             (Way::Kept, Number::I8) => (1.0, 128.0),
             (Way::Kept, Number::I16) => (1.0, 32_768.0),
-            (Way::Kept | Way::Scattered, _) => (1.0, 0.0),
+            (Way::Kept | Way::Names, _) => (1.0, 0.0),
             (Way::Less(less), _) => (1.0, -(less as f64)),
             (Way::Window(Spread { min, max }), _) => {
                 let factor = 65_534.0 / (max - min);
@@ -157,7 +155,7 @@ impl Values {
 
     /// Whether only sameness of values means anything.
     pub(crate) fn are_names(&self) -> bool {
-        self.way == Way::Scattered
+        self.way == Way::Names
     }
 
     /// What the user should know, if anything.
@@ -177,9 +175,10 @@ impl Values {
             Way::Window(Spread { min, max }) => Some(format!(
                 "its values are {number}; those from {min} to {max} are shown in 65535 steps, what lies beyond as the ends"
             )),
-            Way::Scattered => Some(format!(
-                "its values are names of things ({number}), more than 16 bit hold; each is shown as one of 65535 numbers, \
-                 which different things may share"
+            Way::Names if number.bytes() <= 2 => None,
+            Way::Names => Some(format!(
+                "its values are names of things ({number}); up to 65535 they are shown as they are, each larger one as one of \
+                 65535 numbers, which different things may share"
             )),
         }
     }
@@ -200,10 +199,12 @@ impl Values {
     /// Bytes that hold these values, from those of numbers.
     pub(crate) fn convert(&self, stored: Bytes) -> Bytes {
         match (self.number, self.way) {
-            (Number::U8, _) => stored,
+            (Number::U8, _) | (Number::I8, Way::Names) => stored,
             (Number::I8, _) => stored.iter().map(|byte| byte ^ 0x80).collect(),
             (Number::U16, _) if !self.big_endian => stored,
             (Number::U16, _) => self.of(&stored, u16::from_le_bytes, |value| value),
+            // Whatever the sign: other names, and 0 is nothing.
+            (Number::I16, Way::Names) => self.of(&stored, u16::from_le_bytes, |value| value),
             (Number::I16, _) => self.of(&stored, i16::from_le_bytes, |value| {
                 value.cast_unsigned() ^ 0x8000
             }),
@@ -257,12 +258,11 @@ impl Values {
                 u16::try_from(cut).expect("cut to its range")
             }
             Way::Window(_) => self.windowed(value as f64),
-            Way::Scattered if name == 0 => 0,
-            Way::Scattered => {
+            Way::Names => u16::try_from(name).unwrap_or_else(|_| {
                 // Fibonacci hashing: neighbours in number are far apart.
                 let mixed = (name ^ (name >> 32)).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
                 u16::try_from(1 + mixed % 65_535).expect("at most 65535")
-            }
+            }),
         }
     }
 
@@ -373,8 +373,8 @@ mod tests {
             .collect()
     }
 
-    fn fitted(number: Number, min: f64, max: f64, names: bool) -> Values {
-        Values::fitted(number, false, Some(Spread { min, max }), names)
+    fn fitted(number: Number, min: f64, max: f64) -> Values {
+        Values::fitted(number, false, Some(Spread { min, max }))
     }
 
     #[test]
@@ -384,13 +384,13 @@ mod tests {
                 .map(|v| v.to_le_bytes().to_vec())
                 .collect::<Vec<_>>()
         };
-        let values = fitted(Number::U32, 0.0, 40_000.0, false);
+        let values = fitted(Number::U32, 0.0, 40_000.0);
         assert_eq!(
             shown(&values, u32s(&[0, 1, 40_000, 65_535, 70_000])),
             [0, 1, 40_000, 65_535, 65_535]
         );
         // Far from 0, but close together: nothing is lost.
-        let values = fitted(Number::U32, 1_000_000.0, 1_065_000.0, false);
+        let values = fitted(Number::U32, 1_000_000.0, 1_065_000.0);
         assert_eq!(
             shown(&values, u32s(&[1_000_000, 1_000_001, 1_065_000])),
             [1, 2, 65_001]
@@ -405,14 +405,14 @@ mod tests {
                 max: 7.0
             })
         );
-        let values = Values::fitted(Number::I32, true, spread, false);
+        let values = Values::fitted(Number::I32, true, spread);
         assert_eq!(shown(&values, i32s), [1, 6, 13]);
     }
 
     #[test]
     fn what_does_not_fit_gets_a_window_and_is_told() {
         let f32s = [f32::NAN, -3.0, -1.0, 0.0, 3.0, 9.0].map(|v| v.to_le_bytes().to_vec());
-        let values = fitted(Number::F32, -1.0, 3.0, false);
+        let values = fitted(Number::F32, -1.0, 3.0);
         assert_eq!(shown(&values, f32s), [0, 1, 1, 16_385, 65_535, 65_535]);
         let (factor, shift) = values.scale();
         assert!((3.0 * factor + shift - 65_535.0).abs() < 1e-6);
@@ -422,21 +422,45 @@ mod tests {
             "{note}"
         );
         let u32s = [0_u32, 1 << 31, 1 << 20].map(|v| v.to_le_bytes().to_vec());
-        let values = fitted(Number::U32, 0.0, f64::from(1_u32 << 31), false);
+        let values = fitted(Number::U32, 0.0, f64::from(1_u32 << 31));
         assert_eq!(shown(&values, u32s), [1, 65_535, 33]);
-        assert!(fitted(Number::F64, 2.0, 2.0, false).scale().0.is_finite());
+        assert!(fitted(Number::F64, 2.0, 2.0).scale().0.is_finite());
     }
 
     #[test]
     fn names_stay_different_as_far_as_they_can() {
-        let values = fitted(Number::U64, 0.0, 1e12, true);
+        let values = Values::names(Number::U64, false).unwrap();
         let names = (0..1000_u64).map(|n| (n * 1_000_003).to_le_bytes().to_vec());
-        let mut shown = shown(&values, names);
-        assert_eq!(shown[0], 0);
-        shown.sort_unstable();
-        shown.dedup();
-        assert!(shown.len() > 950, "{} of 1000", shown.len());
+        let mut scattered = shown(&values, names);
+        assert_eq!(scattered[0], 0);
+        scattered.sort_unstable();
+        scattered.dedup();
+        assert!(scattered.len() > 950, "{} of 1000", scattered.len());
         assert!(values.note().unwrap().contains("share"));
+        // Those that fit are what they are, and what is beyond them is no one thing.
+        let ids = [1_u64, 2, 65_535, 65_536, 65_537, 70_000, u64::MAX];
+        let shown = shown(&values, ids.map(|v| v.to_le_bytes().to_vec()));
+        assert_eq!(shown[..3], [1, 2, 65_535]);
+        let mut different = shown.clone();
+        different.sort_unstable();
+        different.dedup();
+        assert_eq!(different.len(), ids.len(), "{shown:?}");
+        assert!(!shown.contains(&0));
+        assert!(Values::names(Number::F32, false).is_none());
+    }
+
+    #[test]
+    fn signed_names_are_names_and_0_is_nothing() {
+        let values = Values::names(Number::I16, true).unwrap();
+        let stored = [0_i16, 1, 32_767, -1].map(|v| v.to_be_bytes().to_vec());
+        assert_eq!(shown(&values, stored), [0, 1, 32_767, 65_535]);
+        assert!(values.note().is_none());
+        let values = Values::names(Number::I32, false).unwrap();
+        let stored = [0_i32, 7, -7].map(|v| v.to_le_bytes().to_vec());
+        let shown = shown(&values, stored);
+        assert_eq!(shown[..2], [0, 7]);
+        assert!(shown[2] > 7);
+        assert_eq!(values.of_missing(&[0; 4]), 0);
     }
 
     #[test]

@@ -1,16 +1,23 @@
-//! OME-Zarr images, versions 0.1 to 0.5 and what of 0.6 has the same meaning, wherever [`crate::objects`] reach.
+//! OME-Zarr images, versions 0.1 to 0.6, wherever [`crate::objects`] reach.
 //!
 //! The arrays may be of Zarr version 2 or 3, sharded or not, compressed by blosc, zstd, gzip, zlib or lz4;
 //! their axes any of t, c, z, y, x in any order. Levels may be of any ratio to the finest. Of several times
 //! the first is shown.
+//!
+//! Of version 0.6 (RFC-5), an image is shown in the coordinate system in which its levels lie, where they are placed by scale,
+//! translation or identity, alone or in sequence. Transformations that lead from there to others are told in
+//! [`ZarrSource::notes`], not applied; scenes of several images are refused with their names.
 //!
 //! # Values
 //!
 //! Unsigned integers of 8 and 16 bit are what they are. Signed ones are moved up by half their range, so that
 //! their order stays. Wider numbers are shown in 16 bit: whole ones as they are if those of the coarsest
 //! level fit, others within a window that [`ZarrSource::notes`] tells. A value of 0 counts as nothing
-//! measured, as everywhere. An image that says that it is one of labels (`image-label`) is a volume of labels: ids that
-//! do not fit into 16 bit are scattered over 65535 numbers, which the notes tell as well.
+//! measured, as everywhere.
+//!
+//! An image of whole numbers is a volume of labels where it says so (`image-label`), or lies in a folder `labels` and has no
+//! colours of its own (`omero`), which the notes tell. Its ids stay what they are up to 65535; those of wider
+//! types that do not are scattered over 65535 numbers, whatever was looked at, which the notes tell as well.
 //!
 //! # Reading
 //!
@@ -30,6 +37,7 @@ mod looks;
 mod metadata;
 mod packing;
 mod shard;
+mod space;
 #[cfg(all(test, not(target_family = "wasm")))]
 mod tests;
 
@@ -113,14 +121,21 @@ impl ZarrSource {
         let arrays = join_all(paths.iter().map(|path| array_of(&*objects, path))).await;
         let arrays: Vec<Array> = arrays.into_iter().collect::<Result<_, _>>()?;
         let rank = arrays.first().map_or(0, |array| array.shape.len());
-        let image = Image::parse(ome, rank).map_err(here)?;
+        let mut image = Image::parse(ome, rank).map_err(here)?;
+        let whole = { arrays.first() }.is_some_and(|array| array.number.is_whole());
+        let is_plain = whole && !image.is_labels && ome["omero"].is_null();
+        if is_plain && lies_in_labels(&objects.folders()) {
+            image.is_labels = true;
+            let note = "it lies in a folder labels, so its values are taken for names of things";
+            image.notes.push(note.to_owned());
+        }
         let levels = arrays.into_iter().zip(&paths).map(|(array, path)| {
             let level = LevelArray::new(path, array, &image.axes);
             level.map_err(|refusal| refusal.at(objects.location(path)))
         });
         let levels: Vec<LevelArray> = levels.collect::<Result<_, _>>()?;
         let volume = volume(name, &image, &levels).map_err(here)?;
-        let mut notes = Vec::new();
+        let mut notes = std::mem::take(&mut image.notes);
         if !image.has_size {
             notes.push("the image does not say how large its voxels are; they are taken for 1 micrometer where it does not".to_owned());
         }
@@ -211,6 +226,19 @@ async fn labels(objects: &dyn Objects) -> Vec<String> {
         .take(20)
         .map(str::to_owned)
         .collect()
+}
+
+/// Whether folders, the last of them an image's own, are such that the image is one of labels: they are kept in `labels` of
+/// the image that they belong to, with folders in between or without.
+fn lies_in_labels(folders: &[String]) -> bool {
+    let is_zarr = |name: &String| name.contains(".zarr");
+    let Some((own, above)) = folders.split_last() else {
+        return false;
+    };
+    match above.iter().rposition(is_zarr) {
+        Some(image) => above[image + 1..].iter().any(|name| name == "labels"),
+        None => above.last().is_some_and(|name| name == "labels") && !is_zarr(own),
+    }
 }
 
 /// The volume that an image is.

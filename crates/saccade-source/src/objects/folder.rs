@@ -1,6 +1,6 @@
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use bytes::Bytes;
 
@@ -109,6 +109,15 @@ impl Objects for FolderObjects {
 
     fn location(&self, key: &str) -> String {
         self.folder.join(key).display().to_string()
+    }
+
+    fn folders(&self) -> Vec<String> {
+        let whole = std::path::absolute(&self.folder).unwrap_or_else(|_| self.folder.clone());
+        let names = whole.components().filter_map(|part| match part {
+            Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+            _ => None,
+        });
+        names.collect()
     }
 
     fn read_cost(&self) -> u64 {

@@ -29,6 +29,8 @@ const TAGS: usize = 1 << 14;
 /// Names an object that nobody has: see [`HttpObjects`].
 const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
 
+const ADVICE: &str = "the server wants credentials, or does not allow this object to be read";
+
 /// Objects below an address.
 ///
 /// # Answers
@@ -62,6 +64,8 @@ pub struct HttpObjects {
     requests: Semaphore,
     /// Whether missing objects are forbidden here, once it was asked.
     forbids_missing: OnceCell<bool>,
+    /// Whether any answer was other than a refusal.
+    granted: AtomicBool,
 }
 
 impl HttpObjects {
@@ -95,6 +99,7 @@ impl HttpObjects {
             tags: Cache::new(TAGS),
             requests: Semaphore::new(REQUESTS),
             forbids_missing: OnceCell::new(),
+            granted: AtomicBool::new(false),
         })
     }
 
@@ -132,11 +137,17 @@ impl HttpObjects {
             .patience
             .attempts(self, key, || self.attempt(&url, &part));
         match asked.await? {
-            Found::Object(bytes) => Ok(Some(bytes)),
-            Found::Nothing => Ok(None),
+            Found::Object(bytes) => {
+                self.granted.store(true, Ordering::Relaxed);
+                Ok(Some(bytes))
+            }
+            Found::Nothing => {
+                self.granted.store(true, Ordering::Relaxed);
+                Ok(None)
+            }
             Found::Forbidden if self.forbids_missing().await? => Ok(None),
             Found::Forbidden => Err(ObjectError::Denied {
-                advice: "the server wants credentials, or does not allow this object to be read",
+                advice: ADVICE,
                 location: shown(&url),
             }),
         }
@@ -282,6 +293,17 @@ impl Objects for HttpObjects {
 
     fn location(&self, key: &str) -> String {
         shown(&self.url(key))
+    }
+
+    fn folders(&self) -> Vec<String> {
+        let parts = self.base.path_segments().into_iter().flatten();
+        let parts = parts.filter(|part| !part.is_empty());
+        parts.map(str::to_owned).collect()
+    }
+
+    fn denied(&self) -> Option<&'static str> {
+        let forbidden = self.forbids_missing.get() == Some(&true);
+        (forbidden && !self.granted.load(Ordering::Relaxed)).then_some(ADVICE)
     }
 
     fn read_cost(&self) -> u64 {

@@ -137,6 +137,12 @@ mod tests {
                 (place.to_string(), place.name()),
                 (shown.into(), name.into())
             );
+            let folders = place.objects().unwrap().folders();
+            assert_eq!(
+                folders.last().map(String::as_str),
+                Some(name),
+                "{folders:?}"
+            );
         }
         for bad in ["", "ftp://h/a", "s3:/b", "zarr://"] {
             let error = bad.parse::<Location>().unwrap_err();

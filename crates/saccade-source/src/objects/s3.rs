@@ -1,5 +1,6 @@
 use std::env;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -42,6 +43,8 @@ pub struct S3Objects {
     store: OnceCell<Arc<dyn ObjectStore>>,
     requests: Semaphore,
     forbids_missing: OnceCell<bool>,
+    /// Whether any answer was other than a refusal.
+    granted: AtomicBool,
 }
 
 impl S3Objects {
@@ -94,6 +97,7 @@ impl S3Objects {
             store: OnceCell::new(),
             requests: Semaphore::new(REQUESTS),
             forbids_missing: OnceCell::new(),
+            granted: AtomicBool::new(false),
         };
         objects.build(None)?;
         Ok(objects)
@@ -164,17 +168,27 @@ impl S3Objects {
             .attempts(self, key, || self.attempt(key, &part))
             .await?
         {
-            Found::Object(bytes) => Ok(Some(bytes)),
-            Found::Nothing => Ok(None),
+            Found::Object(bytes) => {
+                self.granted.store(true, Ordering::Relaxed);
+                Ok(Some(bytes))
+            }
+            Found::Nothing => {
+                self.granted.store(true, Ordering::Relaxed);
+                Ok(None)
+            }
             Found::Forbidden if self.forbids_missing().await? => Ok(None),
             Found::Forbidden => Err(ObjectError::Denied {
-                advice: if self.anonymous {
-                    "there are no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
-                } else {
-                    "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and what they allow in this bucket"
-                },
+                advice: self.advice(),
                 location: self.location(key),
             }),
+        }
+    }
+
+    fn advice(&self) -> &'static str {
+        if self.anonymous {
+            "there are no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+        } else {
+            "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and what they allow in this bucket"
         }
     }
 
@@ -224,7 +238,8 @@ impl S3Objects {
                 let source = super::http::chain(&*source);
                 if source.contains("NoSuchBucket") {
                     return Err(Failure::Final(ObjectError::Answer {
-                        answer: "that there is no such bucket".to_owned(),
+                        answer: "that there is no such bucket (check its name, and AWS_ENDPOINT_URL for stores other than Amazon's)"
+                            .to_owned(),
                         location: self.location.to_string(),
                     }));
                 }
@@ -288,6 +303,17 @@ impl Objects for S3Objects {
 
     fn location(&self, key: &str) -> String {
         format!("{}/{key}", self.location)
+    }
+
+    fn folders(&self) -> Vec<String> {
+        let parts = self.location.prefix().split('/');
+        let parts = parts.filter(|part| !part.is_empty());
+        parts.map(str::to_owned).collect()
+    }
+
+    fn denied(&self) -> Option<&'static str> {
+        let forbidden = self.forbids_missing.get() == Some(&true);
+        (forbidden && !self.granted.load(Ordering::Relaxed)).then(|| self.advice())
     }
 
     fn read_cost(&self) -> u64 {

@@ -50,15 +50,16 @@ impl PrecomputedImage {
             objects,
             volume: Arc::new(volume),
             info,
-            values: Arc::new(Values::fitted(number, false, None, false)),
+            values: Arc::new(Values::fitted(number, false, None)),
             indices: Flights::new(INDEX_CACHE, 4096),
         };
-        image.values = Arc::new(match Values::kept(number, false) {
-            Some(kept) => kept,
+        let names = { image.info.is_segmentation }.then(|| Values::names(number, false));
+        let known = { names.flatten() }.or_else(|| Values::kept(number, false));
+        image.values = Arc::new(match known {
+            Some(known) => known,
             None => {
-                let names = image.info.is_segmentation;
                 let sample = image.sample().await?;
-                sample.values(number, false, names, std::iter::empty())
+                sample.values(number, false, std::iter::empty())
             }
         });
         Ok(image)

@@ -78,7 +78,6 @@ impl Sample {
         mut self,
         number: Number,
         big_endian: bool,
-        names: bool,
         declared: impl Iterator<Item = [f64; 2]>,
     ) -> Values {
         if let Some(Spread { min, max }) = self.spread
@@ -107,7 +106,7 @@ impl Sample {
                 });
             }
         }
-        Values::fitted(number, big_endian, self.spread, names)
+        Values::fitted(number, big_endian, self.spread)
     }
 }
 

@@ -208,11 +208,13 @@ impl ZarrImage {
             objects,
             volume: Arc::new(volume),
             levels,
-            values: Arc::new(Values::fitted(number, big_endian, None, false)),
+            values: Arc::new(Values::fitted(number, big_endian, None)),
             indices: Flights::new(INDEX_CACHE.max(index * 2), index),
         };
-        image.values = Arc::new(match Values::kept(number, big_endian) {
-            Some(kept) => kept,
+        let names = { metadata.is_labels }.then(|| Values::names(number, big_endian));
+        let known = { names.flatten() }.or_else(|| Values::kept(number, big_endian));
+        image.values = Arc::new(match known {
+            Some(known) => known,
             None => {
                 let sample = image.sample().await;
                 let sample = sample.map_err(|source| ZarrError::Sample { source })?;
@@ -221,7 +223,7 @@ impl ZarrImage {
                     .iter()
                     .flat_map(|c| [c.window, c.whole])
                     .flatten();
-                sample.values(number, big_endian, metadata.is_labels, declared)
+                sample.values(number, big_endian, declared)
             }
         });
         let (count, dtype) = (image.volume.channels.len(), image.volume.dtype);

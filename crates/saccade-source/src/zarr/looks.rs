@@ -121,7 +121,7 @@ mod tests {
             min: -1.0,
             max: 3.0,
         });
-        let floats = Values::fitted(Number::F32, false, spread, false);
+        let floats = Values::fitted(Number::F32, false, spread);
         let [low, high] = window(&floats, Dtype::Uint16, [0.0, 1.0]).unwrap();
         assert!((low - 0.25).abs() < 1e-4 && (high - 0.5).abs() < 1e-4);
         assert_eq!(window(&floats, Dtype::Uint16, [-1.0, 3.0]), None);
@@ -130,8 +130,7 @@ mod tests {
             window(&kept(Number::U8), Dtype::Uint8, [300.0, 400.0]),
             None
         );
-        let spread = Some(Spread { min: 0.0, max: 1e9 });
-        let names = Values::fitted(Number::U64, false, spread, true);
+        let names = Values::names(Number::U64, false).unwrap();
         assert_eq!(window(&names, Dtype::Uint16, [1.0, 5.0]), None);
     }
 }

@@ -4,6 +4,7 @@ use glam::DVec3;
 use serde_json::Value;
 
 use super::error::Refusal;
+use super::space;
 
 /// What an axis of an array is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,8 +30,10 @@ pub(super) struct Image {
     pub(super) downsampling: Vec<Option<DVec3>>,
     /// Channels, as far as anything is said of them.
     pub(super) channels: Vec<Channel>,
-    /// Whether its values name things.
+    /// Whether it says that its values name things.
     pub(super) is_labels: bool,
+    /// What a user should know of how it is shown, in sentences.
+    pub(super) notes: Vec<String>,
 }
 
 /// What is said of a channel.
@@ -89,6 +92,19 @@ pub(super) fn paths(ome: &Value) -> Result<Vec<String>, Refusal> {
             "it is a list of label images; name one of them, as in LABELS/NAME: {names}"
         )));
     }
+    if let Some(ways) = ome["scene"]["coordinateTransformations"].as_array()
+        && ome["multiscales"].is_null()
+    {
+        let ends = ways.iter().flat_map(|way| [&way["input"], &way["output"]]);
+        let mut names: Vec<&str> = ends.filter_map(|end| end["path"].as_str()).collect();
+        names.sort_unstable();
+        names.dedup();
+        names.truncate(5);
+        let names = names.join(", ");
+        return Err(refused(&format!(
+            "it is a scene of several images; name one of them, as in SCENE/NAME: {names}"
+        )));
+    }
     let multiscale = &ome["multiscales"][0];
     if !multiscale.is_object() {
         return Err(refused(
@@ -118,16 +134,24 @@ impl Image {
     /// Of attributes, and of the number of axes that its arrays have.
     pub(super) fn parse(ome: &Value, rank: usize) -> Result<Self, Refusal> {
         let multiscale = &ome["multiscales"][0];
-        let named = named_axes(multiscale);
+        let space = match multiscale["coordinateSystems"].as_array() {
+            Some(systems) => space::of_systems(multiscale, systems)?,
+            None => space::of_axes(multiscale)?,
+        };
+        let named = space.axes;
         let axes = axes(named, rank)?;
-        let datasets = multiscale["datasets"].as_array();
-        let scales = datasets.into_iter().flatten();
-        let scales = scales.map(|dataset| scale(&axes, &dataset["coordinateTransformations"]));
+        let datasets = multiscale["datasets"].as_array().into_iter().flatten();
+        let placed = datasets.map(|dataset| &dataset["coordinateTransformations"]);
+        let placed: Vec<&Value> = placed.collect();
+        let scales = placed.iter().map(|list| scale(&axes, list));
         let scales: Vec<Option<DVec3>> = scales.collect();
-        let of_all = scale(&axes, &multiscale["coordinateTransformations"]).unwrap_or(DVec3::ONE);
+        let of_all = { space.of_all }
+            .and_then(|transformations| scale(&axes, transformations))
+            .unwrap_or(DVec3::ONE);
         let finest = scales.first().copied().flatten();
         let units = named.and_then(|named| units(named, &axes));
-        let has_size = finest.is_some() && units.is_some();
+        let says_size = finest.is_some() || placed.first().is_some_and(|list| space::stays(list));
+        let has_size = says_size && units.is_some();
         let finest = finest.unwrap_or(DVec3::ONE);
         let mut voxel_nm = finest * of_all * units.unwrap_or(DVec3::splat(1e3));
         if !axes.contains(&Axis::Space(2)) {
@@ -147,6 +171,7 @@ impl Image {
             downsampling: downsampling.collect(),
             channels: channels.map(channel).collect(),
             is_labels: ome["image-label"].is_object(),
+            notes: space.notes,
             axes,
         })
     }
@@ -174,12 +199,6 @@ fn color(text: &str) -> Option<[u8; 3]> {
     let number = digits.then(|| u32::from_str_radix(&text[..6], 16).ok())??;
     let [_, red, green, blue] = number.to_be_bytes();
     Some([red, green, blue])
-}
-
-/// Before version 0.6 axes are listed; there, they are those of the first coordinate system.
-fn named_axes(multiscale: &Value) -> Option<&Vec<Value>> {
-    let listed = multiscale["axes"].as_array();
-    listed.or_else(|| multiscale["coordinateSystems"][0]["axes"].as_array())
 }
 
 /// Axes by name; before version 0.3 they had none, and were t, c, z, y, x.
@@ -236,13 +255,7 @@ fn axes(named: Option<&Vec<Value>>, rank: usize) -> Result<Vec<Axis>, Refusal> {
 
 /// The scale of a list of transformations, x, y, z; 1 for an axis that there is not.
 fn scale(axes: &[Axis], transformations: &Value) -> Option<DVec3> {
-    let list = transformations.as_array()?.iter();
-    // Version 0.6 has sequences of them.
-    let list = list.flat_map(|t| match t["transformations"].as_array() {
-        Some(sequence) => sequence.iter().collect(),
-        None => vec![t],
-    });
-    let scale = { list }.find_map(|t| t["scale"].as_array())?;
+    let scale = space::simple(transformations).find_map(|t| t["scale"].as_array())?;
     let mut result = DVec3::ONE;
     for (axis, value) in axes.iter().zip(scale) {
         if let Axis::Space(axis) = axis {

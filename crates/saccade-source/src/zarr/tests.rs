@@ -2,6 +2,8 @@
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
 mod hostile;
+mod labels;
+mod systems;
 mod written;
 
 use std::fs;
@@ -459,22 +461,6 @@ proptest! {
         if let Ok(source) = open(&folder) {
             let id = ChunkId { channel: 0, level: 0, chunk: UVec3::ZERO };
             drop(runtime().block_on(source.read(id)));
-        }
-    }
-}
-
-#[test]
-fn labels_are_labels_where_the_image_says_so() {
-    for version in [Version::V2, Version::V3] {
-        for dtype in ["uint8", "uint16"] {
-            let folder = tempfile::tempdir().unwrap();
-            write_image(folder.path(), "zyx", dtype, version);
-            assert!(!open(folder.path()).unwrap().volume().kind.is_labels());
-            let mut labels = attributes("zyx", 2);
-            labels["image-label"] = json!({"version": "0.4"});
-            write_attributes(folder.path(), version, &labels);
-            let kind = open(folder.path()).unwrap().volume().kind;
-            assert!(kind.is_labels(), "{dtype}");
         }
     }
 }

@@ -168,8 +168,10 @@ async fn forbidden_is_missing_only_where_all_that_is_missing_is_forbidden() {
             assert!(matches!(got, Ok(None)), "{key}: {got:?}");
         }
         assert_eq!(server.asked(NOBODYS), before + 1, "it is asked once");
+        assert!(store.denied().is_some(), "all was forbidden so far");
         let whole = store.read(".zattrs", Part::Whole { most: 9 }).await;
         assert_eq!(whole.unwrap().as_deref(), Some(&b"{}"[..]));
+        assert_eq!(store.denied(), None, "something may be read");
     }
 }
 
