@@ -8,6 +8,11 @@ use anyhow::{Context, Result};
 pub(crate) fn reset_peak() -> Result<u64> {
     // Documented in proc(5): 5 resets the peak.
     fs::write("/proc/self/clear_refs", "5").context("peaks of memory need Linux's /proc")?;
+    resident()
+}
+
+/// What is resident now \[bytes\].
+pub(crate) fn resident() -> Result<u64> {
     of("VmRSS")
 }
 
@@ -47,6 +52,7 @@ mod tests {
         const TAKEN: usize = 512 << 20;
         let half = TAKEN as u64 / 2;
         let before = reset_peak().unwrap();
+        assert!(resident().unwrap() <= peak().unwrap());
         drop(std::hint::black_box(vec![1_u8; TAKEN]));
         assert!(peak().unwrap() >= before + half);
         assert!(reset_peak().unwrap() < before + half);

@@ -91,6 +91,10 @@ pub(crate) static GROUPS: &[Group] = &[
         measure: |_| serve::measure_nginx(),
     },
     Group {
+        ids: serve::LONG_IDS,
+        measure: serve::measure_long,
+    },
+    Group {
         ids: versus::DENSE_IDS,
         measure: |_| versus::vs_dense_texture(),
     },

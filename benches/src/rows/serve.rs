@@ -26,15 +26,24 @@ use tokio::net::TcpStream;
 use tokio::runtime::Runtime;
 
 use crate::clock::Stopwatch;
+use crate::memory;
 use crate::report::Row;
 use crate::rows::runtime;
 use crate::scene::{Mosaic, NAME};
+use crate::settings::Settings;
+use crate::volumes::Scale;
 
 const SLOWLORIS: &str = "serve.slowloris_p99_ratio";
 const NGINX: &str = "serve.vs_nginx";
 
 pub(crate) const SLOWLORIS_IDS: &[&str] = &[SLOWLORIS];
 pub(crate) const NGINX_IDS: &[&str] = &[NGINX];
+
+const MEMORY_GROWTH: &str = "serve.two_minutes.memory_growth_mb";
+const LONG_P99: &str = "serve.two_minutes.p99_ms";
+const LONG_NGINX: &str = "serve.two_minutes.vs_nginx";
+
+pub(crate) const LONG_IDS: &[&str] = &[MEMORY_GROWTH, LONG_P99, LONG_NGINX];
 
 const RUNS: usize = 3;
 
@@ -176,7 +185,7 @@ pub(crate) fn measure_nginx() -> Result<Vec<Row>> {
     let mut p99 = [Vec::new(), Vec::new()];
     for _ in 0..RUNS {
         for (which, server) in [served.address, nginx.address].into_iter().enumerate() {
-            let (rate, slowest) = client.block_on(load(server, &keys))?;
+            let (rate, slowest) = client.block_on(load(server, &keys, LOAD))?;
             rates[which].push(rate);
             p99[which].push(slowest * 1e3);
         }
@@ -196,29 +205,136 @@ pub(crate) fn measure_nginx() -> Result<Vec<Row>> {
     Ok(vec![row])
 }
 
+/// How long it is for when memory is watched; a twelfth where the scale is small.
+const LONG: Duration = Duration::from_mins(2);
+/// Looks at memory during that.
+const LOOKS: u32 = 12;
+
+/// The same load for long, and what it leaves in memory: the server is in this process, and its clients keep nothing that
+/// grows.
+pub(crate) fn measure_long(settings: &Settings) -> Result<Vec<Row>> {
+    let length = match settings.scale {
+        Some(Scale::Small) => LONG / 12,
+        _ => LONG,
+    };
+    let served = Served::new()?;
+    let client = runtime()?;
+    let keys = Arc::new(served.keys());
+    // Connections, buffers and caches are there before it counts.
+    client.block_on(load(served.address, &keys, length / 12))?;
+    let looks = client.spawn(async move {
+        let mut looks = vec![memory::resident()?];
+        for _ in 0..LOOKS {
+            tokio::time::sleep(length / LOOKS).await;
+            looks.push(memory::resident()?);
+        }
+        anyhow::Ok(looks)
+    });
+    let (rate, p99) = client.block_on(load(served.address, &keys, length))?;
+    let looks: Vec<f64> = { client.block_on(looks)?? }.into_iter().map(mb).collect();
+    let growth = looks[looks.len() - 1] - looks[0];
+    let of_load = |row: Row| {
+        row.setting("clients", CLIENTS)
+            .setting("seconds", length.as_secs())
+            .setting("requests per second", rate.round())
+    };
+    let mut rows = vec![
+        of_load(Row::new(MEMORY_GROWTH, "MB", vec![growth]))
+            .setting("resident [MB], in even steps", rounded(&looks)),
+        of_load(Row::new(LONG_P99, "ms", vec![p99 * 1e3])),
+    ];
+    if let Some(program) = nginx_program() {
+        let nginx = Nginx::start(&program, &served)?;
+        let (nginx_rate, nginx_p99) = client.block_on(load(nginx.address, &keys, length))?;
+        let unit = "of nginx's requests per second";
+        rows.push(
+            of_load(Row::new(LONG_NGINX, unit, vec![rate / nginx_rate]))
+                .setting("nginx's", nginx_rate.round())
+                .setting("nginx's p99 [ms]", rounded(&[nginx_p99 * 1e3])),
+        );
+    }
+    Ok(rows)
+}
+
+fn mb(bytes: u64) -> f64 {
+    bytes as f64 / 1e6
+}
+
 /// Requests per second of all clients, and the 99th percentile \[s\].
-async fn load(server: SocketAddr, keys: &Arc<Vec<String>>) -> Result<(f64, f64)> {
+async fn load(server: SocketAddr, keys: &Arc<Vec<String>>, length: Duration) -> Result<(f64, f64)> {
     let watch = Stopwatch::start();
     let clients = (0..CLIENTS).map(|seed| {
         let keys = keys.clone();
         tokio::spawn(async move {
             let mut client = Client::connect(server).await?;
             let mut choice = Choice(seed as u64);
-            let mut times = Vec::new();
-            while watch.elapsed() < LOAD {
+            let mut times = Times::default();
+            while watch.elapsed() < length {
                 let one = Stopwatch::start();
                 client.get(choice.of(&keys)).await?;
-                times.push(one.elapsed().as_secs_f64());
+                times.add(one.elapsed().as_secs_f64());
             }
             anyhow::Ok(times)
         })
     });
-    let mut times = Vec::new();
+    let mut times = Times::default();
     for client in clients.collect::<Vec<_>>() {
-        times.extend(client.await??);
+        times.merge(&client.await??);
     }
-    let rate = times.len() as f64 / watch.elapsed().as_secs_f64();
-    Ok((rate, percentile99(times)))
+    let rate = times.count() as f64 / watch.elapsed().as_secs_f64();
+    Ok((rate, times.percentile(0.99)))
+}
+
+/// Up to 67 s.
+const BINS: usize = 26 * 64;
+
+/// How many requests took how long, in as much memory for any number of them.
+struct Times([u64; BINS]);
+
+impl Default for Times {
+    fn default() -> Self {
+        Self([0; BINS])
+    }
+}
+
+impl Times {
+    /// The first ends here \[s\].
+    const SHORTEST: f64 = 1e-6;
+    /// In each doubling: no time is taken for one that is 1.1 % longer.
+    const PER_OCTAVE: f64 = 64.0;
+    fn add(&mut self, seconds: f64) {
+        let bin = (seconds / Self::SHORTEST).log2() * Self::PER_OCTAVE;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "below 0 is 0, and what is too large the last"
+        )]
+        let bin = (bin.ceil() as usize).min(BINS - 1);
+        self.0[bin] += 1;
+    }
+
+    fn merge(&mut self, others: &Self) {
+        for (own, other) in self.0.iter_mut().zip(&others.0) {
+            *own += other;
+        }
+    }
+
+    fn count(&self) -> u64 {
+        self.0.iter().sum()
+    }
+
+    /// The time that so many took no longer than, of all \[s\].
+    fn percentile(&self, share: f64) -> f64 {
+        let wanted = self.count() as f64 * share;
+        let mut so_far = 0;
+        let bin = self.0.iter().position(|count| {
+            so_far += count;
+            so_far > 0 && so_far as f64 >= wanted
+        });
+        bin.map_or(f64::NAN, |bin| {
+            Self::SHORTEST * (bin as f64 / Self::PER_OCTAVE).exp2()
+        })
+    }
 }
 
 /// nginx, serving the same bytes as files.
@@ -445,4 +561,30 @@ fn percentile99(mut times: Vec<f64>) -> f64 {
 
 fn rounded(values: &[f64]) -> Vec<f64> {
     values.iter().map(|v| (v * 100.0).round() / 100.0).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn binned_times_have_the_percentiles_of_all() {
+        let mut choice = Choice(7);
+        // From 20 µs to 20 ms, and a few that are not.
+        let mut all: Vec<f64> = (0..5000)
+            .map(|_| 2e-5 * 1000_f64.powf(choice.next() as f64 / u64::MAX as f64))
+            .collect();
+        all.extend([0.0, 1e-9, 3.0, 1e9]);
+        let mut halves = [Times::default(), Times::default()];
+        for (n, time) in all.iter().enumerate() {
+            halves[n % 2].add(*time);
+        }
+        let [mut times, other] = halves;
+        times.merge(&other);
+        assert_eq!(times.count(), all.len() as u64);
+        let (got, want) = (times.percentile(0.99), percentile99(all));
+        assert!((got / want - 1.0).abs() < 0.02, "{got} s for {want} s");
+        assert!(times.percentile(0.5) < got / 10.0);
+        assert!(Times::default().percentile(0.99).is_nan());
+    }
 }
