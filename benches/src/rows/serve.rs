@@ -59,30 +59,50 @@ const REQUESTS: usize = 4000;
 pub(crate) fn measure_slowloris() -> Result<Vec<Row>> {
     let served = Served::new()?;
     let client = runtime()?;
-    let keys = Arc::new(served.keys());
-    let mut ratios = Vec::new();
-    let mut p99 = [Vec::new(), Vec::new()];
+    let keys = served.keys();
     let slow = slow_sockets();
+    let ratio = |[idle, attacked]: [f64; 2]| attacked / idle;
+    let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+    // What the attack costs whoever is attacked, on this machine.
+    let nginx = nginx_program().map(|program| Nginx::start(&program, &served));
+    let nginx = nginx.transpose()?;
     for _ in 0..RUNS {
-        let idle = client.block_on(good_client(served.address, &keys))?;
-        let attackers = Attackers::start(served.address, slow)?;
-        // The answers to their arrival are over.
-        client.block_on(async { tokio::time::sleep(BYTE).await });
-        let attacked = client.block_on(good_client(served.address, &keys))?;
-        attackers.stop();
-        client.block_on(async { tokio::time::sleep(BYTE).await });
-        ratios.push(attacked / idle);
-        p99[0].push(idle * 1e3);
-        p99[1].push(attacked * 1e3);
+        ours.push(among_slow_clients(&client, served.address, &keys, slow)?);
+        if let Some(nginx) = &nginx {
+            theirs.push(among_slow_clients(&client, nginx.address, &keys, slow)?);
+        }
     }
-    let row = Row::new(SLOWLORIS, "of the idle p99", ratios)
+    let p99 = |of: usize| rounded(&ours.iter().map(|p99| p99[of] * 1e3).collect::<Vec<_>>());
+    let ratios = ours.iter().copied().map(ratio).collect();
+    let mut row = Row::new(SLOWLORIS, "of the idle p99", ratios)
         .setting("slow sockets", slow)
         .setting("a byte every", "1 s each")
         .setting("requests per run", REQUESTS)
         .setting("chunk", "64 x 64 x 32, stitched before")
-        .setting("idle p99 [ms]", rounded(&p99[0]))
-        .setting("p99 among them [ms]", rounded(&p99[1]));
+        .setting("idle p99 [ms]", p99(0))
+        .setting("p99 among them [ms]", p99(1));
+    if !theirs.is_empty() {
+        let ratios: Vec<_> = theirs.into_iter().map(ratio).collect();
+        row = row.setting("nginx in our place, from files", rounded(&ratios));
+    }
     Ok(vec![row])
+}
+
+/// The 99th percentile of a good client's requests, alone and among slow clients \[s\].
+fn among_slow_clients(
+    client: &Runtime,
+    server: SocketAddr,
+    keys: &[String],
+    slow: usize,
+) -> Result<[f64; 2]> {
+    let idle = client.block_on(good_client(server, keys))?;
+    let attackers = Attackers::start(server, slow)?;
+    // The answers to their arrival are over.
+    client.block_on(async { tokio::time::sleep(BYTE).await });
+    let attacked = client.block_on(good_client(server, keys))?;
+    attackers.stop();
+    client.block_on(async { tokio::time::sleep(BYTE).await });
+    Ok([idle, attacked])
 }
 
 /// As many as the process may have, beside what the server keeps of them.
@@ -362,7 +382,7 @@ impl Nginx {
             .join(" ");
         let settings = format!(
             "worker_processes auto; daemon off; pid {root}/pid; error_log stderr error; \
-             events {{ worker_connections 1024; }} \
+             worker_rlimit_nofile 30000; events {{ worker_connections 20000; }} \
              http {{ access_log off; sendfile on; tcp_nopush on; tcp_nodelay on; \
              keepalive_requests 1000000000; open_file_cache max=10000; {temporary} \
              default_type application/octet-stream; server {{ listen {address}; root {root}; }} }}"
