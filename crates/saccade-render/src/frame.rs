@@ -10,9 +10,9 @@ use saccade_core::volume::Volume;
 use crate::channel::ChannelView;
 use crate::layout::{
     CHANNEL_RESIDENCY, CHANNEL_VALUES, ChannelUniform, DepthUniform, FLAG_FALSE_COLORS,
-    FLAG_JITTER, FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform, HEAT_LOOKUPS, HEAT_NODES, HEAT_NONE,
-    HEAT_SAMPLES, LevelUniform, MODE_EMISSION_ABSORPTION, MODE_ISO_SURFACE, MODE_MAXIMUM,
-    MOST_CHANNELS, MOST_DEPTHS, MOST_PLANES, OctreeUniform,
+    FLAG_JITTER, FLAG_NEAREST, FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform, HEAT_LOOKUPS,
+    HEAT_NODES, HEAT_NONE, HEAT_SAMPLES, LevelUniform, MODE_EMISSION_ABSORPTION, MODE_ISO_SURFACE,
+    MODE_MAXIMUM, MOST_CHANNELS, MOST_DEPTHS, MOST_PLANES, OctreeUniform,
 };
 use crate::memory::plan::Plan;
 use crate::octree::ResidencyOctree;
@@ -149,7 +149,8 @@ pub(crate) fn frame_uniform(
         flags: flag(view.substitute, FLAG_SUBSTITUTE)
             | flag(view.false_colors, FLAG_FALSE_COLORS)
             | flag(view.jitter, FLAG_JITTER)
-            | flag(values_hold, FLAG_OCTREE),
+            | flag(values_hold, FLAG_OCTREE)
+            | flag(volume.kind.is_labels(), FLAG_NEAREST),
         low_nm: (low_nm - eye_nm).as_vec3(),
         depth: tables.shape().depth,
         high_nm: (high_nm - eye_nm).as_vec3(),

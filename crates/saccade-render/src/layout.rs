@@ -16,6 +16,8 @@ pub(crate) const FLAG_JITTER: u32 = 4;
 
 /// Skip and substitute by the residency octree.
 pub(crate) const FLAG_OCTREE: u32 = 8;
+/// Values are not mixed between voxels.
+pub(crate) const FLAG_NEAREST: u32 = 16;
 
 /// Channels that can be seen at once.
 pub(crate) const MOST_CHANNELS: usize = 16;
@@ -337,6 +339,7 @@ mod tests {
             ("FLAG_FALSE_COLORS", FLAG_FALSE_COLORS),
             ("FLAG_JITTER", FLAG_JITTER),
             ("FLAG_OCTREE", FLAG_OCTREE),
+            ("FLAG_NEAREST", FLAG_NEAREST),
             ("MOST_CHANNELS", u32::try_from(MOST_CHANNELS).unwrap()),
             ("MOST_PLANES", u32::try_from(MOST_PLANES).unwrap()),
             ("CHANNEL_VALUES", CHANNEL_VALUES),

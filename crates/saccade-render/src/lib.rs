@@ -62,6 +62,7 @@
 //! - **Clipping** ([`Clip`]) cuts the ray before it is cut into segments.
 //! - 16-bit voxels are **exact**: in textures of 16 bit, or as two parts of 8 bit that are joined before they
 //!   are interpolated.
+//! - **Labels** ([`VoxelKind`](saccade_core::volume::VoxelKind)) are not interpolated: no sample has a number that no object has.
 //! - What is **missing** is drawn from the nearest coarser level that is there, else from up to two
 //!   levels finer, else not at all. Where no good substitute is there, a brick two levels coarser
 //!   and the coarsest one are asked for first: they come soon and show much.

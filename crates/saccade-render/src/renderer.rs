@@ -7,7 +7,7 @@ use glam::{UVec2, Vec2};
 use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
 use saccade_core::page_table::{PageTableShape, PageTables};
 use saccade_core::transfer::TransferFunction;
-use saccade_core::volume::{Dtype, Polarity, Volume};
+use saccade_core::volume::{Dtype, Polarity, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 
 use crate::channel::{self, ChannelError, ChannelView};
@@ -159,7 +159,12 @@ impl Renderer {
         })?;
         let bands = options.bands.max(1);
         let format = BrickFormat::new(volume.dtype, gpu.device().features(), options.split_16_bit);
-        let resources = Resources::new(gpu, &plan, format.texture, bands);
+        // Between two objects' numbers lies no third object's.
+        let filter = match volume.kind {
+            VoxelKind::Labels => wgpu::FilterMode::Nearest,
+            VoxelKind::Intensity => wgpu::FilterMode::Linear,
+        };
+        let resources = Resources::new(gpu, &plan, format.texture, bands, filter);
         let readback = |_| Readback {
             staging: Staging::new(gpu.device(), plan.report_bytes()),
             frame: 0,

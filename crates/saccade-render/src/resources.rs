@@ -39,7 +39,13 @@ pub(crate) struct Picture {
 
 impl Resources {
     /// Caches of bricks in a format of one or two bytes a texel.
-    pub(crate) fn new(gpu: &Gpu, plan: &Plan, format: wgpu::TextureFormat, bands: u32) -> Self {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        plan: &Plan,
+        format: wgpu::TextureFormat,
+        bands: u32,
+        filter: wgpu::FilterMode,
+    ) -> Self {
         let device = gpu.device();
         let align = device.limits().min_uniform_buffer_offset_alignment;
         let frame_stride = size_u32::<FrameUniform>().next_multiple_of(align);
@@ -72,9 +78,9 @@ impl Resources {
             view_formats: &[],
         });
         let sampler = device.create_sampler(&wgpu::SamplerDescriptor {
-            label: Some("trilinear"),
-            mag_filter: wgpu::FilterMode::Linear,
-            min_filter: wgpu::FilterMode::Linear,
+            label: Some("bricks"),
+            mag_filter: filter,
+            min_filter: filter,
             ..Default::default()
         });
         Self {

@@ -151,20 +151,6 @@ pub(crate) struct Opened {
     pub(crate) acquisition: Option<AcquisitionReader>,
 }
 
-impl Opened {
-    /// Says what pictures of labels are.
-    pub(crate) fn tell_of_labels(&self) {
-        let volume = self.source.volume();
-        if volume.kind.is_labels() {
-            say(&format!(
-                "volume {:?} holds labels, which are drawn like shades so far: where two objects meet, pictures show \
-                 numbers between theirs; the numbers themselves are what a server or an export gives",
-                volume.name
-            ));
-        }
-    }
-}
-
 impl Place {
     /// Opens the volume of that name, or the first; one of an archive is stitched as told.
     pub(crate) async fn open(

@@ -266,7 +266,10 @@ fn stored_at(at: vec3f) -> f32 {
 // too much of the high one; so the eight texels are joined first.
 fn stored_of_parts(at: vec3f) -> f32 {
     let low = floor(at - 0.5);
-    let t = at - 0.5 - low;
+    var t = at - 0.5 - low;
+    if has_flag(FLAG_NEAREST) {
+        t = round(t);
+    }
     let texel = vec3i(low);
     let x0 = vec4f(
         joined(texel),

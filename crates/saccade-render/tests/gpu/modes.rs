@@ -1,15 +1,20 @@
 //! Ways to draw, and what is cut away.
 
-use glam::{DVec3, UVec2};
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use glam::{DVec3, UVec2, UVec3};
 use saccade_core::camera::Camera;
 use saccade_core::space::Point;
+use saccade_core::transfer::ColorMap;
+use saccade_core::volume::{Polarity, Volume, VoxelKind};
 use saccade_render::{
     Clip, Gpu, HalfSpace, Heat, Image, Mode, Renderer, RendererOptions, Slab, Traversal, View, Work,
 };
 
 use crate::harness::{frame, gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
-use crate::scene::{Scene, specks, stained, tissue, waves};
+use crate::scene::{Scene, ramp, specks, stained, tissue, waves};
 
 const SIZE: UVec2 = UVec2::new(72, 56);
 
@@ -64,6 +69,56 @@ fn the_largest_value_is_drawn() {
                 45.0,
             );
         }
+    }
+}
+
+/// How many colours a plane across two objects has, numbers 10 and 200 times a factor, besides the background.
+fn colors_of_two(gpu: &Gpu, kind: VoxelKind, factor: u16, split_16_bit: bool) -> usize {
+    let value = |nm: DVec3| if nm.x < 50.0 { 10.0 } else { 200.0 };
+    let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 1.0)], 100.0);
+    let mut scene = Scene::new(UVec3::splat(40), DVec3::splat(2.5), transfer, value);
+    if factor > 1 {
+        scene = scene.deep(factor);
+    }
+    scene.volume = Arc::new(Volume {
+        kind,
+        ..(*scene.volume).clone()
+    });
+    let slab = Slab {
+        point: Point::new(DVec3::splat(51.0)),
+        normal: DVec3::Z,
+        thickness_nm: 0.0,
+    };
+    let view = View {
+        mode: Mode::Maximum,
+        lod_bias: -20.0,
+        clip: Clip {
+            slab: Some(slab),
+            ..Clip::default()
+        },
+        ..views(&scene)[0]
+    };
+    let options = RendererOptions {
+        split_16_bit,
+        ..RendererOptions::default()
+    };
+    let mut renderer = Renderer::new(gpu, scene.volume.clone(), options).unwrap();
+    renderer.set_channels(&scene.views()).unwrap();
+    settle(&mut renderer, &view, &scene);
+    let pixels = read(&renderer).rgba;
+    let colors: HashSet<_> = pixels.chunks_exact(4).collect();
+    assert!(colors.contains(&pixels[..4]), "the background is seen");
+    colors.len() - 1
+}
+
+#[test]
+fn between_two_labels_there_is_no_third() {
+    let Some(gpu) = gpu() else { return };
+    for (factor, split) in [(1, false), (7, false), (7, true), (256, true)] {
+        let colors = |kind| colors_of_two(&gpu, kind, factor, split);
+        let case = format!("factor {factor}, in two parts: {split}");
+        assert_eq!(colors(VoxelKind::Labels), 2, "{case}");
+        assert!(colors(VoxelKind::Intensity) > 2, "shades are mixed, {case}");
     }
 }
 

@@ -156,7 +156,6 @@ impl Render {
             .place
             .open(&self.catalog, self.volume.as_deref(), &self.stitching)
             .await?;
-        opened.tell_of_labels();
         let source = opened.source;
         let mut shown = Shown {
             mode: self.mode,

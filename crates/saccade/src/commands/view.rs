@@ -47,7 +47,6 @@ impl View {
             .place
             .open(&self.catalog, self.volume.as_deref(), &self.stitching)
             .await?;
-        opened.tell_of_labels();
         let Opened {
             source,
             acquisition,

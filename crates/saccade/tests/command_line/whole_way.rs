@@ -84,10 +84,10 @@ fn planes_slabs_cuts_and_the_work_of_rays_are_pictures_of_their_own() {
     let pictures = [
         whole,
         of(&["--slice", "z=6"]),
-        of(&["--slice", "0.3,-1,0@300,250,6"]),
+        of(&["--slice", "0.3,-1,0@75,65,6"]),
         of(&["--slice", "z=6", "--slab", "160"]),
-        of(&["--cut", "-1,0,0@300,250,6"]),
-        of(&["--cut", "-1,0,0@300,250,6", "--cut", "y=250"]),
+        of(&["--cut", "-1,0,0@75,65,6"]),
+        of(&["--cut", "-1,0,0@75,65,6", "--cut", "y=65"]),
         of(&["--heat", "samples=200"]),
         of(&["--detail", "3"]),
     ];

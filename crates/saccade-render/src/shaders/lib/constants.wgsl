@@ -15,6 +15,7 @@ const FLAG_SUBSTITUTE = 1u;
 const FLAG_FALSE_COLORS = 2u;
 const FLAG_JITTER = 4u;
 const FLAG_OCTREE = 8u;
+const FLAG_NEAREST = 16u;
 
 const MOST_CHANNELS = 16u;
 const MOST_PLANES = 6u;
