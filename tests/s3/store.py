@@ -10,9 +10,15 @@ import threading
 import time
 from collections import Counter
 
+from botocore.auth import S3SigV4Auth
+from botocore.awsrequest import AWSRequest
+from botocore.credentials import Credentials
 from moto.server import ThreadedMotoServer
 
 BUCKET = "lab"
+# Whoever asks may read it, and nothing else.
+PUBLIC = "public"
+KEY = ("id", "secret")
 
 
 class Store:
@@ -26,7 +32,8 @@ class Store:
         self.server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
         self.server.start()
         self.host, self.port = self.server.get_host_and_port()
-        self.request("PUT", f"/{BUCKET}")
+        for bucket in [BUCKET, PUBLIC]:
+            self.request("PUT", f"/{bucket}")
 
     def request(self, method, path, body=None):
         connection = http.client.HTTPConnection(self.host, self.port, timeout=20)
@@ -53,8 +60,31 @@ class Store:
         status, body = self.request("GET", f"/{BUCKET}/{prefix}/{name}")
         return body if status == 200 else None
 
+    def put_folder(self, folder, bucket, prefix):
+        for path in folder.rglob("*"):
+            if path.is_file():
+                status, _ = self.request("PUT", f"/{bucket}/{prefix}/{path.relative_to(folder)}", path.read_bytes())
+                assert status == 200, path
+
     def close(self):
         self.server.stop()
+
+
+def refusal(method, path, headers):
+    """The code with which a store that checks signatures refuses a request, if it does."""
+    signed = headers.get("Authorization")
+    if not signed:
+        return None if path.startswith(f"/{PUBLIC}/") and method in ("GET", "HEAD") else "AccessDenied"
+    said = dict(part.strip().split("=", 1) for part in signed.split(" ", 1)[1].split(","))
+    key, _, region, service, _ = said["Credential"].split("/")
+    if key != KEY[0]:
+        return "InvalidAccessKeyId"
+    names = said["SignedHeaders"].split(";")
+    request = AWSRequest(method, f"http://{headers['Host']}{path}", {name: headers[name] for name in names})
+    request.context["timestamp"] = headers["x-amz-date"]
+    auth = S3SigV4Auth(Credentials(*KEY), service, region)
+    text = auth.string_to_sign(request, auth.canonical_request(request))
+    return None if auth.signature(text, request) == said["Signature"] else "SignatureDoesNotMatch"
 
 
 class Proxy:
@@ -66,6 +96,11 @@ class Proxy:
         self.random = random.Random(seed)
         self.lock = threading.Lock()
         self.faults = {}
+        # Whether signatures are checked; whether each question is refused when it is asked for the first time.
+        self.checks = False
+        self.busy_at_first = False
+        self.asked = Counter()
+        self.answers = Counter()
         self.requests = Counter()
         self.done = Counter()
         self.latency = 0
@@ -78,6 +113,14 @@ class Proxy:
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
                 fault = proxy.next_fault(self.command)
                 time.sleep(proxy.latency)
+                signed = self.headers.get("Authorization") is not None
+                if proxy.checks:
+                    refused = refusal(self.command, self.path, self.headers)
+                    proxy.counted((signed, refused))
+                    if refused:
+                        return self.answer(403, [], f"<Error><Code>{refused}</Code></Error>".encode())
+                if proxy.busy_at_first and proxy.is_first((self.command, self.path, self.headers.get("Range"))):
+                    fault = "busy"
                 if fault == "busy":
                     return self.answer(503, [], b"<Error><Code>SlowDown</Code></Error>")
                 if fault == "denied":
@@ -86,6 +129,8 @@ class Proxy:
                     return self.reset()
                 connection = http.client.HTTPConnection(store.host, store.port, timeout=20)
                 headers = {k: v for k, v in self.headers.items() if k.lower() != "connection"}
+                if not signed:  # The buckets of moto's are nobody's but their owner's.
+                    headers.update(store.SIGNED)
                 connection.request(self.command, self.path, body, headers)
                 answer = connection.getresponse()
                 content = answer.read()
@@ -153,6 +198,15 @@ class Proxy:
                     self.done[fault] += 1
                     return fault
             return None
+
+    def is_first(self, question):
+        with self.lock:
+            self.asked[question] += 1
+            return self.asked[question] == 1
+
+    def counted(self, answer):
+        with self.lock:
+            self.answers[answer] += 1
 
     def close(self):
         self.server.shutdown()
