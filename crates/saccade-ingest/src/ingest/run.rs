@@ -11,7 +11,7 @@ use futures::future::{Either, select};
 use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{
-    AcquisitionError, AcquisitionInfo, Record, RecordLine, RecordReader, TileRecord,
+    AcquisitionError, AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
 };
 use saccade_archive::catalog::{CatalogError, Claim, Quarantined, Waiting, Worker};
 use saccade_core::volume::check_name;
@@ -392,6 +392,10 @@ impl Supply<'_> {
         let claim = || catalog.claim(volume, self.worker, most);
         let claims = retry(options, progress, claim).await?;
         let claimed = claims.len();
+        if claimed > 0 {
+            // Somebody may have read them from another acquisition since this one last looked.
+            self.catch_up().await?;
+        }
         for claim in claims {
             let deaths = claim.deaths;
             let job = Job::claimed(claim, options);
@@ -404,22 +408,30 @@ impl Supply<'_> {
         Ok(claimed)
     }
 
+    /// Goes to where the volume's records were read up to, whoever did, if they are these: what is in the queue is not
+    /// to be looked for in another acquisition's images.
+    async fn catch_up(&mut self) -> Result<Cursor, IngestError> {
+        let (options, progress) = (self.options, self.context.progress);
+        let (catalog, volume) = (self.archive.catalog(), self.context.volume);
+        let from = retry(options, progress, || catalog.cursor(volume)).await?;
+        if self.reader.cursor() != from {
+            *self.reader = RecordReader::new(self.context.folder, from);
+        }
+        patiently(options, progress, || self.reader.recognize()).await?;
+        Ok(from)
+    }
+
     /// Reads new records: tiles are put in the queue, the rest is done with at once, up to one that
     /// speaks of a tile whose older records are still in the queue. Whether there were any.
     async fn read_ahead(&mut self) -> Result<bool, IngestError> {
         let (options, progress) = (self.options, self.context.progress);
         let (catalog, volume) = (self.archive.catalog(), self.context.volume);
         let batch = options.batch.max(1);
-        // Also where nothing new is read: what is in the queue is not to be found in others' images.
-        patiently(options, progress, || self.reader.recognize()).await?;
+        // Another worker may have read on.
+        let from = self.catch_up().await?;
         let (queued, _) = retry(options, progress, || catalog.queued(volume)).await?;
         if queued >= batch as u64 {
             return Ok(false);
-        }
-        // Another worker may have read on.
-        let from = retry(options, progress, || catalog.cursor(volume)).await?;
-        if self.reader.cursor() != from {
-            *self.reader = RecordReader::new(self.context.folder, from);
         }
         let lines = patiently(options, progress, || self.reader.read(batch)).await?;
         self.blocked = false;

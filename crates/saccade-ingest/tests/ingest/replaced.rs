@@ -127,6 +127,71 @@ async fn what_is_queued_is_not_looked_for_in_others_images() {
     assert_eq!(scope.ingest(&archive).await.tiles, 1);
 }
 
+/// Two begin at once, on a volume of which nothing was read: whoever reads first says whose it is.
+#[tokio::test]
+async fn what_another_acquisition_s_ingest_reads_first_is_left_to_it() {
+    let (ours, other) = (acquired("a", 3), acquired("b", 5));
+    // Images that the other's records would find as well.
+    for n in 0..3 {
+        other.image(&format!("a{n}"), SIZE, 200);
+    }
+    let text = fs::read(other.path().join(RecordReader::FILE)).unwrap();
+    fs::remove_file(other.path().join(RecordReader::FILE)).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path()).await;
+    let options = IngestOptions {
+        once: false,
+        batch: 1,
+        ..quick()
+    };
+    let (diary, cancel) = (Diary::default(), Cancel::new());
+    let work = run(other.path(), &archive, &options, &diary, &cancel);
+    let begin = async {
+        while diary.states().is_empty() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        // Read, and not worked on yet.
+        let catalog = archive.catalog();
+        let mut reader = RecordReader::new(ours.path(), Cursor::default());
+        let mut commit = catalog.begin(VOLUME).await.unwrap();
+        for line in reader.read(9).unwrap() {
+            let Ok(Record::Tile(record)) = line.record else {
+                panic!("a tile")
+            };
+            let (position, reason) = (line.offset, String::new());
+            let waiting = Waiting {
+                position,
+                record,
+                reason,
+            };
+            commit.enqueue(&waiting).await.unwrap();
+        }
+        let read = reader.cursor();
+        assert!(commit.advance(Cursor::default(), read).await.unwrap());
+        commit.finish().await.unwrap();
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, 0);
+        fs::write(other.path().join(RecordReader::FILE), text).unwrap();
+    };
+    let (done, ()) = tokio::join!(work, begin);
+    let Err(IngestError::Acquisition(error)) = done else {
+        panic!("{done:?}")
+    };
+    assert!(
+        matches!(error, AcquisitionError::RecordsReplaced { .. }),
+        "{error:?}"
+    );
+    // All of it is there for the first.
+    assert_eq!(ours.ingest(&archive).await.tiles, 3);
+    let alone = {
+        let folder = tempfile::tempdir().unwrap();
+        let archive = crate::scope::archive(folder.path()).await;
+        ours.ingest(&archive).await;
+        seen(&archive).await
+    };
+    assert!(seen(&archive).await == alone);
+}
+
 #[tokio::test]
 async fn records_replaced_while_they_are_followed_end_it() {
     for (count, in_place) in [(3, false), (9, false), (3, true), (9, true)] {
