@@ -187,7 +187,8 @@ impl<F: Folders> Watch<F> {
         if let Some(info) = &info {
             differences.extend(volume_differences(info, &config.info));
         }
-        if let Some(there) = linked.as_ref().filter(|to| **to != folder) {
+        // One that is gone from where it was has moved here.
+        if let Some(there) = linked.as_ref().filter(|to| **to != folder && to.exists()) {
             let (there, now) = (there.to_string_lossy(), folder.to_string_lossy());
             differences.push(difference("folder", &there, &now));
         }

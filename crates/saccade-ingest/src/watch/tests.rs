@@ -488,6 +488,27 @@ fn a_folder_is_watched_on_with_the_same_options_alone() {
 }
 
 #[test]
+fn a_folder_that_moved_is_watched_on_and_another_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    image(&scope.join("s3/r2_c1_b.tif"), 40, 9);
+    looks(&mut Watch::open(config(), Disk, &scope, &kept).unwrap());
+    assert_eq!(told(&kept).len(), 1);
+    let other = folder.path().join("other");
+    fs::create_dir_all(&other).unwrap();
+    let opened = Watch::open(config(), Disk, &other, &kept).map(|_| ());
+    let refused = opened.unwrap_err().to_string();
+    assert!(refused.contains("folder is"), "{refused}");
+    let moved = folder.path().join("moved");
+    fs::rename(&scope, &moved).unwrap();
+    looks(&mut Watch::open(config(), Disk, &moved, &kept).unwrap());
+    assert_eq!(told(&kept).len(), 1, "what was told is known");
+    image(&moved.join("s3/r2_c2_b.tif"), 40, 11);
+    looks(&mut Watch::open(config(), Disk, &moved, &kept).unwrap());
+    assert_eq!(told(&kept).len(), 2);
+}
+
+#[test]
 fn a_mistake_that_took_nothing_in_binds_nobody() {
     let folder = tempfile::tempdir().unwrap();
     let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
