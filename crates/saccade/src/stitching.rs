@@ -63,11 +63,16 @@ fn cache_size(text: &str) -> Result<CacheSize, String> {
         .map_err(|_| "give a number of GB, such as 20 or 1.5, or with a unit, such as 500MB")?;
     let bytes = number * unit;
     let least = DiskCache::LEAST_BYTES;
-    if !(bytes >= least as f64 && bytes <= 1e18) {
+    if bytes.is_nan() || bytes < least as f64 {
         let least = least.div_ceil(1_000_000);
         return Err(format!(
             "a cache on disk takes {least} MB at least; leave out --disk-cache for none"
         ));
+    }
+    let most = DiskCache::MOST_BYTES;
+    if bytes > most as f64 {
+        let most = most / 1_000_000_000;
+        return Err(format!("a cache on disk takes {most} GB at most"));
     }
     #[expect(clippy::cast_possible_truncation, reason = "within bounds")]
     let bytes = bytes as u64;
@@ -121,7 +126,8 @@ impl Stitching {
                     Ok(cache) => Some(cache),
                     Err(error @ DiskCacheError::Foreign { .. }) => return Err(error.into()),
                     Err(error) => {
-                        say(&format!("without a cache on disk: {error}"));
+                        let error = anyhow::Error::from(error);
+                        say(&format!("without a cache on disk: {error:#}"));
                         None
                     }
                 }
@@ -182,5 +188,9 @@ mod tests {
             assert!(cache_size(bad).is_err(), "{bad}");
         }
         assert!(cache_size("0").unwrap_err().contains("269 MB at least"));
+        for large in ["3TB", "1e30", "inf"] {
+            let told = cache_size(large).unwrap_err();
+            assert!(told.contains("2199 GB at most"), "{large}: {told}");
+        }
     }
 }

@@ -13,6 +13,8 @@
 //! Everything is checked by a sum when it is read. What is damaged, cannot be read or does not fit is
 //! built again: it costs time, and nothing else.
 
+use std::collections::BTreeSet;
+use std::error::Error;
 use std::fmt;
 use std::fs::File;
 use std::hash::{BuildHasher, Hasher, RandomState};
@@ -28,8 +30,15 @@ use foyer::{
 use saccade_archive::IDENTITY;
 use saccade_archive::storage::{Storage, StorageError};
 
-/// Unit in which the cache is written over \[bytes\]: several blocks of voxels.
+/// Least unit in which the cache is written over \[bytes\]: several blocks of voxels. Each is a file.
 const UNIT: u64 = 64 << 20;
+/// Largest unit \[bytes\]: places in it are kept in 32 bits.
+const UNIT_MOST: u64 = 1 << 32;
+/// Units above which they grow, as long as they may: all are open at once, and a process may often have no more
+/// than 1024 files open.
+const MANY: u64 = 320;
+/// Units that there are at most.
+const MOST: u64 = 512;
 /// Units that are always there: one being written, one being freed, two to be read.
 const LEAST: u64 = 4;
 /// How its files are named, as far as their number.
@@ -65,10 +74,33 @@ pub enum DiskCacheError {
     #[error("the cache folder cannot be used: {}", folder.display())]
     Open {
         /// What went wrong.
-        source: Box<dyn std::error::Error + Send + Sync>,
+        source: Box<dyn Error + Send + Sync>,
         /// The folder.
         folder: PathBuf,
     },
+}
+
+/// How a cache is cut.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Units {
+    /// Bytes of each.
+    bytes: u64,
+    /// How many.
+    count: u64,
+}
+
+impl Units {
+    /// Of a cache of so many bytes. They double as it grows, so that about as large a one finds its blocks again.
+    fn of(bytes: u64) -> Self {
+        let mut unit = UNIT;
+        while unit < UNIT_MOST && bytes / unit > MANY {
+            unit *= 2;
+        }
+        Self {
+            bytes: unit,
+            count: (bytes / unit).clamp(LEAST, MOST),
+        }
+    }
 }
 
 /// A folder that keeps finished blocks over restarts, bounded in bytes. For all volumes of a process.
@@ -96,50 +128,44 @@ impl PartialEq for DiskCache {
 impl DiskCache {
     /// Least that a cache takes \[bytes\].
     pub const LEAST_BYTES: u64 = LEAST * UNIT;
+    /// Most that a cache takes \[bytes\].
+    pub const MOST_BYTES: u64 = MOST * UNIT_MOST;
 
     /// Opens a folder, made if it is not there, that takes at most `bytes` (and at least
-    /// [`Self::LEAST_BYTES`]).
+    /// [`Self::LEAST_BYTES`], and never more than [`Self::MOST_BYTES`]). Where that fails, nothing new is left
+    /// in it.
     ///
     /// # Errors
     ///
     /// [`DiskCacheError`].
     pub async fn open(folder: &Path, bytes: u64) -> Result<Self, DiskCacheError> {
-        let failed = |source: Box<dyn std::error::Error + Send + Sync>| DiskCacheError::Open {
-            source,
-            folder: folder.to_owned(),
-        };
-        let units = (bytes / UNIT).max(LEAST);
-        let lock = {
-            let folder = folder.to_owned();
-            let prepared = tokio::task::spawn_blocking(move || prepare(&folder, units)).await;
-            let prepared = prepared.unwrap_or_else(|e| Err(io::Error::other(e)));
-            prepared.map_err(|e| failed(e.into()))?
-        };
+        let units = Units::of(bytes);
         let named = || folder.to_owned();
-        let lock = match lock {
-            Prepared::Ours(lock) => lock,
-            Prepared::Taken => return Err(DiskCacheError::Taken { folder: named() }),
-            Prepared::Foreign => return Err(DiskCacheError::Foreign { folder: named() }),
+        let failed = |source| DiskCacheError::Open {
+            source,
+            folder: named(),
         };
-        let size = |bytes: u64| usize::try_from(bytes).unwrap_or(usize::MAX);
-        let device = FsDeviceBuilder::new(folder).with_capacity(size(units * UNIT));
-        let device = device.build().map_err(|e| failed(e.into()))?;
-        let engine = BlockEngineConfig::new(device)
-            .with_block_size(size(UNIT))
-            .with_buffer_pool_size(size(UNIT))
-            .with_submit_queue_size_threshold(size(2 * UNIT));
-        // Blocks in memory are kept elsewhere.
-        let blocks = HybridCacheBuilder::new()
-            .memory(1)
-            .with_shards(1)
-            .with_weighter(|_: &u64, block: &Bytes| block.len())
-            .storage()
-            .with_io_engine_config(PsyncIoEngineConfig::new())
-            .with_engine_config(engine)
-            .with_recover_mode(RecoverMode::Quiet)
-            .build()
-            .await
-            .map_err(|e| failed(e.into()))?;
+        let in_folder = named();
+        // Hundreds of files are opened, and what is in them is listed: not where others wait for their turn.
+        let opened =
+            tokio::task::spawn_blocking(move || -> Result<_, Box<dyn Error + Send + Sync>> {
+                let (lock, made) = match prepare(&in_folder, units)? {
+                    Prepared::Ours(lock, made) => (lock, made),
+                    Prepared::Taken(folder) => return Ok(Err(DiskCacheError::Taken { folder })),
+                    Prepared::Foreign(folder) => {
+                        return Ok(Err(DiskCacheError::Foreign { folder }));
+                    }
+                };
+                match tokio::runtime::Handle::current().block_on(blocks(&in_folder, units)) {
+                    Ok(blocks) => Ok(Ok((blocks, lock))),
+                    Err(error) => {
+                        made.remove(&in_folder);
+                        Err(cause(error))
+                    }
+                }
+            });
+        let opened = opened.await.map_err(|e| failed(e.into()))?;
+        let (blocks, lock) = opened.map_err(failed)??;
         Ok(Self(Arc::new(Inner {
             blocks,
             lock: RwLock::new(Some(lock)),
@@ -213,14 +239,90 @@ fn key(description: &[u8]) -> u64 {
         })
 }
 
+/// Opens the files of a folder, and lists what is in them.
+async fn blocks(folder: &Path, units: Units) -> foyer::Result<HybridCache<u64, Bytes>> {
+    let size = |bytes: u64| usize::try_from(bytes).unwrap_or(usize::MAX);
+    let device = FsDeviceBuilder::new(folder).with_capacity(size(units.count * units.bytes));
+    let engine = BlockEngineConfig::new(device.build()?)
+        .with_block_size(size(units.bytes))
+        .with_buffer_pool_size(size(UNIT))
+        .with_submit_queue_size_threshold(size(2 * UNIT));
+    // Blocks in memory are kept elsewhere.
+    HybridCacheBuilder::new()
+        .memory(1)
+        .with_shards(1)
+        .with_weighter(|_: &u64, block: &Bytes| block.len())
+        .storage()
+        .with_io_engine_config(PsyncIoEngineConfig::new())
+        .with_engine_config(engine)
+        .with_recover_mode(RecoverMode::Quiet)
+        .build()
+        .await
+}
+
+/// What the system said, where it did: the error around it says that again, and much of the library's own.
+fn cause(error: foyer::Error) -> Box<dyn Error + Send + Sync> {
+    let mut inner: Option<&(dyn Error + 'static)> = Some(&error);
+    while let Some(at) = inner {
+        let system = at.downcast_ref::<io::Error>();
+        if let Some(code) = system.and_then(io::Error::raw_os_error) {
+            return io::Error::from_raw_os_error(code).into();
+        }
+        inner = at.source();
+    }
+    error.into()
+}
+
 /// What a folder is.
 enum Prepared {
     /// This process's.
-    Ours(File),
+    Ours(File, Made),
     /// Another process's.
-    Taken,
+    Taken(PathBuf),
     /// No cache's.
-    Foreign,
+    Foreign(PathBuf),
+}
+
+/// What is new in a folder.
+struct Made {
+    /// The folder itself.
+    folder: bool,
+    /// The mark of a cache, and the file that is locked.
+    mark: bool,
+    /// Units that are not: they were there before.
+    kept: BTreeSet<u64>,
+}
+
+impl Made {
+    /// Takes it away again, as far as that can be done.
+    fn remove(&self, folder: &Path) {
+        let remove = || -> io::Result<()> {
+            for entry in std::fs::read_dir(folder)? {
+                let entry = entry?;
+                let new = number_of(&entry).is_some_and(|n| !self.kept.contains(&n));
+                if new && entry.file_type()?.is_file() {
+                    std::fs::remove_file(entry.path())?;
+                }
+            }
+            if self.mark {
+                std::fs::remove_file(folder.join(MARKER))?;
+                std::fs::remove_file(folder.join(LOCK))?;
+            }
+            if self.folder {
+                std::fs::remove_dir(folder)?;
+            }
+            Ok(())
+        };
+        if let Err(error) = remove() {
+            log::warn!("what was made of the cache on disk could not be removed: {error}");
+        }
+    }
+}
+
+/// Which unit a file is.
+fn number_of(entry: &std::fs::DirEntry) -> Option<u64> {
+    let name = entry.file_name();
+    name.to_str()?.strip_prefix(FILES)?.parse().ok()
 }
 
 /// Whether a folder may become a cache, or is one: also one of an earlier version, which had no marker.
@@ -238,31 +340,43 @@ fn is_cache(folder: &Path) -> io::Result<bool> {
     Ok(true)
 }
 
-/// Makes the folder, takes it if nobody has it, and removes files of a larger cache.
-fn prepare(folder: &Path, units: u64) -> io::Result<Prepared> {
+/// Makes the folder, takes it if nobody has it, and removes files of a cache of another size: units that are too
+/// many, and those of other units.
+fn prepare(folder: &Path, units: Units) -> io::Result<Prepared> {
+    let there = folder.exists();
     std::fs::create_dir_all(folder)?;
     if !is_cache(folder)? {
-        return Ok(Prepared::Foreign);
+        return Ok(Prepared::Foreign(folder.to_owned()));
     }
+    let marked = folder.join(MARKER).exists();
     let lock = File::create(folder.join(LOCK))?;
     match lock.try_lock() {
         Ok(()) => {}
-        Err(std::fs::TryLockError::WouldBlock) => return Ok(Prepared::Taken),
+        Err(std::fs::TryLockError::WouldBlock) => return Ok(Prepared::Taken(folder.to_owned())),
         Err(std::fs::TryLockError::Error(error)) => return Err(error),
     }
     std::fs::write(
         folder.join(MARKER),
         "blocks of voxels that Saccade has stitched\n",
     )?;
+    let mut kept = BTreeSet::new();
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
-        let name = entry.file_name();
-        let number = { name.to_str() }.and_then(|name| name.strip_prefix(FILES));
-        if { number.and_then(|n| n.parse::<u64>().ok()) }.is_some_and(|n| n >= units) {
-            std::fs::remove_file(entry.path())?;
+        let metadata = entry.metadata()?;
+        if let Some(number) = number_of(&entry).filter(|_| metadata.is_file()) {
+            if number < units.count && metadata.len() == units.bytes {
+                kept.insert(number);
+            } else {
+                std::fs::remove_file(entry.path())?;
+            }
         }
     }
-    Ok(Prepared::Ours(lock))
+    let made = Made {
+        folder: !there,
+        mark: !marked && kept.is_empty(),
+        kept,
+    };
+    Ok(Prepared::Ours(lock, made))
 }
 
 /// What tells an archive from every other, made if it has none; `None` where it cannot be written.
@@ -284,4 +398,36 @@ pub(super) async fn identity(storage: &dyn Storage) -> Option<Bytes> {
     }
     // Another process may have done the same at the same time.
     storage.read(IDENTITY, None).await.ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn there_are_never_many_files() {
+        let of = |bytes: u64| {
+            let units = Units::of(bytes);
+            (units.bytes >> 20, units.count)
+        };
+        assert_eq!(of(0), (64, LEAST));
+        assert_eq!(of(1 << 30), (64, 16));
+        // The default stays as it was.
+        assert_eq!(of(20_000_000_000), (64, 298));
+        assert_eq!(of(100_000_000_000), (512, 186));
+        assert_eq!(of(1_500_000_000_000), (4096, 349));
+        assert_eq!(of(u64::MAX), (4096, MOST));
+        for bits in 28..63 {
+            for bytes in [1_u64 << bits, (1 << bits) + (1 << (bits - 1)) + 12345] {
+                let units = Units::of(bytes);
+                assert!(units.bytes.is_multiple_of(UNIT) && units.bytes <= UNIT_MOST);
+                assert!((LEAST..=MOST).contains(&units.count));
+                let taken = units.bytes * units.count;
+                assert!(taken <= bytes, "{taken} of {bytes}");
+                // Nearly all of it is made use of, up to the most.
+                let wanted = bytes.min(DiskCache::MOST_BYTES);
+                assert!(taken >= wanted - wanted / 100 || units.bytes == UNIT);
+            }
+        }
+    }
 }

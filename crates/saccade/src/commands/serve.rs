@@ -92,25 +92,28 @@ impl Serve {
         }
         let storage = self.place.storage().context("there is no archive")?;
         let location = Place::archive(storage, &self.catalog)?;
-        let opened = waited_for(|| VisualizationArchive::open(&location));
-        let archive = tokio::select! {
-            archive = opened => archive?,
-            () = interrupted() => return Ok(()),
-        };
-        let server = Server::bind(self.at.address()).await?;
+        // One ear from the beginning: who is not listening when a signal comes never hears of it.
+        let mut interrupted = Box::pin(interrupted());
         let volumes = Volumes::new();
-        let options = self.stitching.options(&location).await?;
+        let prepare = async {
+            let archive = waited_for(|| VisualizationArchive::open(&location)).await?;
+            let server = Server::bind(self.at.address()).await?;
+            let options = self.stitching.options(&location).await?;
+            let offered = offer_archive(&volumes, &archive, options.clone()).await?;
+            if offered.is_empty() {
+                say("the archive holds no volumes yet; they are offered as they appear");
+            }
+            anyhow::Ok((archive, server, options))
+        };
+        let (archive, server, options) = tokio::select! {
+            prepared = prepare => prepared?,
+            () = &mut interrupted => return Ok(()),
+        };
         let disk_cache = options.disk_cache.clone();
-        if offer_archive(&volumes, &archive, options.clone())
-            .await?
-            .is_empty()
-        {
-            say("the archive holds no volumes yet; they are offered as they appear");
-        }
         tell(&server.url());
         let follow = follow_archive(&volumes, &archive, options, POLL);
         tokio::select! {
-            served = server.run(volumes.clone(), self.at.options(), interrupted()) => served?,
+            served = server.run(volumes.clone(), self.at.options(), interrupted) => served?,
             () = follow => {}
         }
         if let Some(cache) = disk_cache {

@@ -204,3 +204,77 @@ fn folders_that_cannot_be_used_are_told() {
         assert!(matches!(open, Err(DiskCacheError::Open { .. })), "{open:?}");
     });
 }
+
+#[test]
+fn a_cache_that_cannot_be_opened_names_the_cause_and_leaves_nothing_new() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cache");
+        let names = || {
+            let entries = std::fs::read_dir(&path).unwrap();
+            let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+            names.collect::<std::collections::BTreeSet<_>>()
+        };
+        let unit = |n: u32| format!("foyer-storage-direct-fs-{n:08}");
+        let fails = async || {
+            let error = DiskCache::open(&path, 0).await.unwrap_err();
+            let cause = std::error::Error::source(&error)
+                .expect("a cause")
+                .to_string();
+            assert!(cause.starts_with("Is a directory"), "{cause}");
+        };
+        // Two files are made before the third cannot be.
+        std::fs::create_dir_all(path.join(unit(2))).unwrap();
+        fails().await;
+        assert_eq!(names(), [unit(2)].into());
+        // What was there before is kept.
+        std::fs::remove_dir(path.join(unit(2))).unwrap();
+        DiskCache::open(&path, 0).await.unwrap().close().await;
+        let all = names();
+        assert_eq!(all.len(), 4 + 2);
+        std::fs::remove_file(path.join(unit(1))).unwrap();
+        std::fs::remove_file(path.join(unit(3))).unwrap();
+        std::fs::create_dir_all(path.join(unit(3))).unwrap();
+        fails().await;
+        let mut left = all.clone();
+        left.remove(&unit(1));
+        assert_eq!(names(), left);
+        // And once it can be opened, all is there.
+        std::fs::remove_dir(path.join(unit(3))).unwrap();
+        DiskCache::open(&path, 0).await.unwrap().close().await;
+        assert_eq!(names(), all);
+    });
+}
+
+#[test]
+fn a_cache_of_other_units_begins_anew() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let fixture = wide().await;
+        let blocks = fill(&fixture, folder.path()).await;
+        let files = || {
+            let entries = std::fs::read_dir(folder.path()).unwrap();
+            entries.map(|entry| entry.unwrap().metadata().unwrap().len())
+        };
+        // Its files are holes but for what is written: they take little space.
+        for found in [0, blocks] {
+            let cache = DiskCache::open(folder.path(), 22 << 30).await.unwrap();
+            assert_eq!(files().filter(|&len| len == 128 << 20).count(), 176);
+            assert_eq!(
+                files().count(),
+                176 + 2,
+                "none of the smaller units is left"
+            );
+            let options = StitchedOptions {
+                disk_cache: Some(cache.clone()),
+                ..StitchedOptions::default()
+            };
+            let source = fixture.open_with(options).await;
+            let (coverage, most) = difference(&read_all(&source).await, &fixture.expected());
+            assert_eq!((coverage, most <= 1), (0, true));
+            assert_eq!(source.statistics().blocks_from_disk, found);
+            drop(source);
+            cache.close().await;
+        }
+    });
+}
