@@ -157,7 +157,8 @@ pub enum CheckError {
 /// listed. With [`CheckOptions::repair`], orphans of a safe age are deleted; a tile whose pyramid is
 /// missing or damaged is given back to ingest if the acquisition still has its record and image,
 /// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
-/// damaged object: ingest replaces it.
+/// damaged object: ingest replaces it. A folder in the place of a pyramid is found as damage and not repaired:
+/// somebody has to take it away first.
 ///
 /// # Errors
 ///
@@ -297,6 +298,15 @@ impl Check<'_> {
                 ..
             }) => (FindingKind::Missing, "the pyramid is not there".to_owned()),
             Err(PyramidError::Storage { source, .. }) => match source {
+                // Ingest could not write there either: it is a person's to mend, and is only told.
+                StorageError::Occupied { .. } => {
+                    let reason =
+                        "a folder lies in the place of the pyramid, and is left as it is; take it \
+                                  away, then `saccade check --repair` mends the tile"
+                            .to_owned();
+                    self.find(FindingKind::Damaged, entry, Some(tile), reason);
+                    return Ok(());
+                }
                 // One file that the disk cannot read is damaged; a store that is away says nothing.
                 StorageError::Io { source, .. } => {
                     (FindingKind::Damaged, format!("it cannot be read: {source}"))

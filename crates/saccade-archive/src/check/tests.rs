@@ -122,7 +122,16 @@ async fn every_damage_is_found_and_named() {
         change(&mut bytes);
         fs::write(path, bytes).unwrap();
     }
-    let kinds: [Case<'_>; 10] = [
+    let kinds: [Case<'_>; 11] = [
+        (
+            "a folder",
+            |f| {
+                fs::remove_file(f.path(3)).unwrap();
+                fs::create_dir(f.path(3)).unwrap();
+            },
+            true,
+            &[(FindingKind::Damaged, "t3")],
+        ),
         (
             "gone",
             |f| fs::remove_file(f.path(2)).unwrap(),
@@ -269,4 +278,44 @@ async fn repairs_touch_nothing_that_is_whole() {
         fixture.archive.catalog().entry(VOLUME).await.unwrap().tiles,
         6
     );
+}
+
+#[tokio::test]
+async fn a_folder_in_the_place_of_a_pyramid_is_told_and_the_others_are_repaired() {
+    let fixture = Fixture::new().await;
+    for folder in [0, 3] {
+        fs::remove_file(fixture.path(folder)).unwrap();
+        fs::create_dir(fixture.path(folder)).unwrap();
+    }
+    fs::write(fixture.path(4), "damaged").unwrap();
+    let options = CheckOptions {
+        repair: true,
+        acquisition: Some(fixture.acquisition.path().to_owned()),
+        safe_age: Duration::ZERO,
+        ..CheckOptions::default()
+    };
+    let repairs = async || {
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        assert_eq!(report.tiles, u64::from(TILES));
+        let told = |f: &Finding| f.reason.contains("take it away");
+        let findings = report.findings.iter();
+        let repairs = findings.map(|f| (f.tile.clone().unwrap(), f.repair, told(f)));
+        (repairs.collect::<Vec<_>>(), report.damage())
+    };
+    let of = |n: u32, repair, told| (format!("t{n}"), repair, told);
+    let queued = Some(Repair::Queued);
+    let want = vec![of(0, None, true), of(3, None, true), of(4, queued, false)];
+    assert_eq!(repairs().await, (want, 2));
+    assert!(fixture.path(0).is_dir() && fixture.path(3).is_dir());
+    // Once it is away, the tile is given back to ingest.
+    fs::remove_dir(fixture.path(3)).unwrap();
+    let want = vec![
+        of(0, None, true),
+        of(3, queued, false),
+        of(4, queued, false),
+    ];
+    assert_eq!(repairs().await, (want, 1));
+    let waiting = fixture.archive.catalog().waiting(VOLUME).await.unwrap();
+    let waiting: Vec<_> = waiting.into_iter().map(|w| w.record.tile).collect();
+    assert_eq!(waiting, ["t3", "t4"]);
 }
