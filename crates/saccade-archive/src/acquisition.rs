@@ -11,8 +11,9 @@
 //! stack, [`trakem2`] the affine transforms of a TrakEM2 project.
 //!
 //! Reading never changes the archive. Unknown fields are ignored, so that a microscope may say
-//! more than is understood here; but one of `volume.json` that is spelt almost as a known one is refused, for
-//! then something else than what was meant would be taken in.
+//! more than is understood here; but one of `volume.json` that is spelt almost as a known one is refused, and so is
+//! a tile's record without a `channel` that has almost one, for then something else than what was meant would be
+//! taken in.
 //!
 //! A link that leads out of the folder is not followed, be it an image or the records: whoever writes the folder
 //! would show files that are another's. The folder itself may be one.
@@ -248,7 +249,7 @@ impl AcquisitionInfo {
             }
             Err(source) => return Err(AcquisitionError::Read { source, path }),
         };
-        if let Some((key, meant)) = key::misspelt(&text) {
+        if let Some((key, meant)) = key::misspelt(&text, &key::KNOWN) {
             return Err(AcquisitionError::Key { key, meant, path });
         }
         let info: Self = match serde_json::from_slice(&text) {
@@ -430,8 +431,7 @@ mod tests {
             ("channel", "channels"),
             ("Channels", "channels"),
             ("dType", "dtype"),
-            ("type", "dtype"),
-            ("kinds", "kind"),
+            ("knid", "kind"),
             ("voxel-nm", "voxel_nm"),
         ] {
             let refused = read(&format!(r#","{key}":["SE"]"#)).unwrap_err();
@@ -456,8 +456,8 @@ mod tests {
             }
         ));
         // What a microscope says besides is its own.
-        let own =
-            r#","kV":1.5,"date":"May","operator":{"kinds":1},"stage":[1],"sample":"x","size":3"#;
+        let own = r#","kV":1.5,"date":"May","operator":{"kinds":1},"stage":[1],"sample":"x","size":3,
+            "names":["a"],"game":1,"type":"SEM""#;
         assert!(read(own).is_ok());
         // Twice is not once.
         let twice = read(r#","dtype":"uint8","dtype":"uint16""#).unwrap_err();

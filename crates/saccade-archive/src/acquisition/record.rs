@@ -9,7 +9,7 @@ use saccade_core::transform::SectionFromTile;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::{AcquisitionError, refuse_link_out};
+use super::{AcquisitionError, key, refuse_link_out};
 
 /// Bytes a line may have; a longer one is broken.
 const MAX_LINE: usize = 1 << 16;
@@ -19,6 +19,17 @@ const HEAD: usize = 4096;
 
 /// Bytes before a cursor by which records are known again: about three tiles.
 const TAIL: usize = 512;
+
+/// Keys of tiles' records, and first of them the one that may be left out.
+const KEYS: [&str; 7] = [
+    "channel",
+    "record",
+    "tile",
+    "file",
+    "section",
+    "size",
+    "transform",
+];
 
 /// One line of `tiles.jsonl`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -282,7 +293,7 @@ impl RecordReader {
             let record = if read.bytes > MAX_LINE as u64 {
                 Err(format!("it has {} bytes, more than {MAX_LINE}", read.bytes))
             } else {
-                serde_json::from_slice(&text).map_err(|e| e.to_string())
+                parse(&text)
             };
             let line = self.cursor.line;
             let record = record.map_err(|reason| BrokenRecord::of(&text, line, reason));
@@ -294,6 +305,31 @@ impl RecordReader {
         }
         Ok(Ok(lines))
     }
+}
+
+/// A record, or what is wrong with it.
+fn parse(text: &[u8]) -> Result<Record, String> {
+    match serde_json::from_slice(text) {
+        // A key that is needed is missed; this one would be the volume's first channel without a word.
+        Ok(Record::Tile(tile)) if tile.channel.is_none() => match hint(text, &KEYS[..1]) {
+            Some(hint) => Err(hint),
+            None => Ok(Record::Tile(tile)),
+        },
+        Ok(record) => Ok(record),
+        Err(error) => Err(match hint(text, &KEYS) {
+            Some(hint) => format!("{error}; {hint}"),
+            None => error.to_string(),
+        }),
+    }
+}
+
+/// A key that is almost one of these, as it is told.
+fn hint(text: &[u8], known: &[&'static str]) -> Option<String> {
+    let (key, meant) = key::misspelt(text, known)?;
+    Some(format!(
+        "{key:?} means nothing in a record; is {meant:?} meant? A key of the microscope's own needs a name that \
+         is less like it"
+    ))
 }
 
 /// What lies before a place in the records, as far as it takes to know it again. Other acquisitions of the same
@@ -551,6 +587,45 @@ mod tests {
         let reason = |n: usize| lines[n].record.as_ref().unwrap_err().reason.clone();
         assert!(reason(2).contains("inverted"), "{}", reason(2));
         assert!(reason(4).contains("bytes"), "{}", reason(4));
+    }
+
+    #[test]
+    fn a_key_that_is_almost_one_that_counts_sets_its_record_aside() {
+        let read = |text: &str| {
+            let folder = tempfile::tempdir().unwrap();
+            std::fs::write(folder.path().join(RecordReader::FILE), format!("{text}\n")).unwrap();
+            let mut reader = RecordReader::new(folder.path(), Cursor::default());
+            reader.read(9).unwrap().remove(0).record
+        };
+        let good = serde_json::to_string(&tile("a")).unwrap();
+        let with = |more: &str| format!("{},{more}}}", good.strip_suffix('}').unwrap());
+        for key in ["chanel", "Channel", "channels", "chan_nel", "chnanel"] {
+            let broken = read(&with(&format!(r#""{key}":"BSE""#))).unwrap_err();
+            assert_eq!((broken.line, broken.tile.as_deref()), (1, Some("a")));
+            let told = broken.to_string();
+            for part in [&format!("{key:?}"), "is \"channel\" meant?"] {
+                assert!(told.contains(part), "{part:?} is not in: {told}");
+            }
+        }
+        // What the microscope says besides is its own, also beside what it is like.
+        for own in [
+            r#""kV":1.5,"files":2,"sizes":[],"tiles":1,"stage":{"chanel":1},"panel":"chanel""#,
+            r#""transforms":[],"sections":4,"records":1"#,
+        ] {
+            assert_eq!(read(&with(own)), Ok(tile("a")), "{own}");
+        }
+        let both = read(&with(r#""channel":"BSE","chanel":1"#)).unwrap();
+        let Record::Tile(both) = both else {
+            panic!("not a tile")
+        };
+        assert_eq!(both.channel, Some(ChannelRef::Name("BSE".to_owned())));
+        let moved = r#"{"record":"transform","tile":"a","transform":[1,0,0,1,2,3],"chanel":1}"#;
+        assert!(read(moved).is_ok(), "it has no channel");
+        // One that is needed is missed anyway.
+        let broken = read(&good.replace("section", "secton")).unwrap_err();
+        for part in ["missing field `section`", "is \"section\" meant?"] {
+            assert!(broken.reason.contains(part), "{}", broken.reason);
+        }
     }
 
     #[test]
