@@ -188,7 +188,7 @@ mod tests {
             assert!(cache_size(bad).is_err(), "{bad}");
         }
         assert!(cache_size("0").unwrap_err().contains("269 MB at least"));
-        for large in ["3TB", "1e30", "inf"] {
+        for large in ["3TB", "2200", "1000000TB"] {
             let told = cache_size(large).unwrap_err();
             assert!(told.contains("2199 GB at most"), "{large}: {told}");
         }
