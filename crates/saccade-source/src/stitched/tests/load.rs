@@ -52,7 +52,8 @@ impl Turnstile {
     async fn settles(&self, is: impl Fn(&Self) -> bool) {
         let mut since = 0;
         let mut asked = self.asked();
-        while since < 10 {
+        // So long that a thread that waits for its turn on a busy machine has had it.
+        while since < 50 {
             tokio::time::sleep(Duration::from_millis(2)).await;
             let same = asked == self.asked() && is(self);
             since = if same { since + 1 } else { 0 };
@@ -161,8 +162,7 @@ fn requests_that_are_dropped_end_their_reads() {
             source.read(chunk(level, block)).await.unwrap();
             assert_eq!(source.statistics().blocks_built, 1);
         }
-        // One in each case at least; how many more there were at once is the scheduler's.
-        assert!(dropped > 5, "{dropped} reads were under way");
+        assert!(dropped >= 10, "{dropped} reads were under way");
     });
 }
 
