@@ -43,4 +43,5 @@ mod visualization;
 pub use catalog::CatalogLocation;
 pub use visualization::{
     ArchiveError, ArchiveLocation, IDENTITY, LocationError, StorageLocation, VisualizationArchive,
+    read_identity,
 };

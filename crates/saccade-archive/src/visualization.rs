@@ -10,7 +10,7 @@ use std::sync::Arc;
 use crate::catalog::{Catalog, CatalogError, CatalogLocation};
 use crate::storage::{Storage, StorageError};
 
-pub use identity::IDENTITY;
+pub use identity::{IDENTITY, read_identity};
 pub use location::{ArchiveLocation, LocationError, StorageLocation};
 
 /// An open archive. Clones share it.
@@ -49,6 +49,18 @@ pub enum ArchiveError {
     )]
     Strangers {
         /// Where the pyramids lie.
+        storage: StorageLocation,
+        /// Where the catalog is.
+        catalog: CatalogLocation,
+    },
+    /// The storage's identity is damaged, and nothing else tells whose it is.
+    #[error(
+        "the object {IDENTITY:?} of {storage} is empty or damaged, and the catalog {catalog} names no pyramid by \
+         which they could be known to belong together. If they do, delete the object: `saccade ingest` writes it \
+         anew"
+    )]
+    Identity {
+        /// Where the object lies.
         storage: StorageLocation,
         /// Where the catalog is.
         catalog: CatalogLocation,

@@ -1,8 +1,8 @@
 //! Whether a catalog and a storage are parts of one archive.
 //!
 //! Both get the same random identity when the archive is made: the catalog in a table, the storage in an
-//! object. Where one of them has none, made by an earlier version or lost, it counts whether any of the
-//! pyramids that the catalog names are there.
+//! object. Where one of them has none, made by an earlier version or lost, or the object is damaged, it counts
+//! whether any of the pyramids that the catalog names are there.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 
@@ -15,18 +15,92 @@ use crate::storage::{Storage, StorageError};
 /// Name of the storage's object that holds the identity.
 pub const IDENTITY: &str = "identity";
 
+/// Hexadecimal digits of an identity.
+const DIGITS: usize = 32;
+
 /// Another one than any before.
 fn random() -> String {
     let random = || RandomState::new().build_hasher().finish();
     format!("{:016x}{:016x}", random(), random())
 }
 
-async fn of_storage(storage: &dyn Storage) -> Result<Option<String>, StorageError> {
-    match storage.read(IDENTITY, None).await {
-        Ok(bytes) => Ok(Some(String::from_utf8_lossy(&bytes).trim().to_owned())),
-        Err(StorageError::NotFound { .. }) => Ok(None),
-        Err(error) => Err(error),
+/// The identity that the bytes of [`IDENTITY`] say; `None` if they are cut short or otherwise damaged.
+pub fn read_identity(bytes: &[u8]) -> Option<String> {
+    let text = std::str::from_utf8(bytes).ok()?.trim();
+    let whole = text.len() == DIGITS && text.bytes().all(|byte| byte.is_ascii_hexdigit());
+    whole.then(|| text.to_owned())
+}
+
+/// What a storage has as its identity.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Mark {
+    /// Nothing.
+    None,
+    /// One.
+    Whole(String),
+    /// What was one, or was about to become one.
+    Damaged,
+}
+
+/// What both parts say of themselves.
+struct Parts {
+    catalog: Option<String>,
+    storage: Mark,
+}
+
+impl Parts {
+    async fn read(catalog: &Catalog, storage: &dyn Storage) -> Result<Self, ArchiveError> {
+        let mark = match storage.read(IDENTITY, None).await {
+            Ok(bytes) => read_identity(&bytes).map_or(Mark::Damaged, Mark::Whole),
+            Err(StorageError::NotFound { .. }) => Mark::None,
+            Err(error) => return Err(error.into()),
+        };
+        Ok(Self {
+            catalog: catalog.identity().await?,
+            storage: mark,
+        })
     }
+
+    /// Whether they belong together; `None` if they do not say.
+    fn agree(&self) -> Option<bool> {
+        match (&self.catalog, &self.storage) {
+            (Some(one), Mark::Whole(other)) => Some(one == other),
+            _ => None,
+        }
+    }
+}
+
+/// Refuses parts of different archives; what those of one say of themselves.
+async fn meet(
+    catalog: &Catalog,
+    storage: &dyn Storage,
+    location: &ArchiveLocation,
+) -> Result<Parts, ArchiveError> {
+    let parts = Parts::read(catalog, storage).await?;
+    match parts.agree() {
+        Some(true) => return Ok(parts),
+        Some(false) => return Err(strangers(location)),
+        None => {}
+    }
+    let named = catalog.some_pyramids().await?;
+    if named.is_empty() {
+        if parts.storage == Mark::Damaged {
+            return Err(ArchiveError::Identity {
+                storage: location.storage().clone(),
+                catalog: location.catalog().clone(),
+            });
+        }
+        return Ok(parts);
+    }
+    // Of several, one at least must be there.
+    for name in &named {
+        match storage.size(name).await {
+            Ok(_) => return Ok(parts),
+            Err(StorageError::NotFound { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
+    Err(strangers(location))
 }
 
 /// Refuses parts of different archives.
@@ -35,13 +109,14 @@ pub(super) async fn check(
     storage: &dyn Storage,
     location: &ArchiveLocation,
 ) -> Result<(), ArchiveError> {
-    match (catalog.identity().await?, of_storage(storage).await?) {
-        // Of an earlier version: nothing speaks against it.
-        (None, None) => Ok(()),
-        (Some(one), Some(other)) if one == other => Ok(()),
-        (Some(_), Some(_)) => Err(strangers(location)),
-        _ => look_for_pyramids(catalog, storage, location).await,
+    let parts = meet(catalog, storage, location).await?;
+    if parts.storage == Mark::Damaged {
+        log::warn!(
+            "the object {IDENTITY:?} of {} is damaged; the next `saccade ingest` into it writes it anew",
+            location.storage()
+        );
     }
+    Ok(())
 }
 
 /// Refuses parts of different archives, and gives those of one archive its identity if they have none yet.
@@ -50,16 +125,24 @@ pub(super) async fn make(
     storage: &dyn Storage,
     location: &ArchiveLocation,
 ) -> Result<(), ArchiveError> {
-    let (known, there) = (catalog.identity().await?, of_storage(storage).await?);
-    if known.is_some() && there.is_some() {
-        return match known == there {
-            true => Ok(()),
-            false => Err(strangers(location)),
-        };
+    let parts = meet(catalog, storage, location).await?;
+    if parts.agree().is_some() {
+        return Ok(());
     }
-    look_for_pyramids(catalog, storage, location).await?;
+    let there = match parts.storage {
+        Mark::Whole(identity) => Some(identity),
+        Mark::None => None,
+        Mark::Damaged => {
+            log::warn!(
+                "the object {IDENTITY:?} of {} was damaged, and is written anew: pyramids that its catalog names \
+                 are there",
+                location.storage()
+            );
+            None
+        }
+    };
     // The catalog decides, where several processes do this at once.
-    let proposed = there.clone().or(known).unwrap_or_else(random);
+    let proposed = there.clone().or(parts.catalog).unwrap_or_else(random);
     let identity = catalog.give_identity(&proposed).await?;
     match there {
         Some(there) if there == identity => {}
@@ -70,26 +153,6 @@ pub(super) async fn make(
         }
     }
     Ok(())
-}
-
-/// Of several pyramids that the catalog names, one at least must be there.
-async fn look_for_pyramids(
-    catalog: &Catalog,
-    storage: &dyn Storage,
-    location: &ArchiveLocation,
-) -> Result<(), ArchiveError> {
-    let named = catalog.some_pyramids().await?;
-    for name in &named {
-        match storage.size(name).await {
-            Ok(_) => return Ok(()),
-            Err(StorageError::NotFound { .. }) => {}
-            Err(error) => return Err(error.into()),
-        }
-    }
-    match named.is_empty() {
-        true => Ok(()),
-        false => Err(strangers(location)),
-    }
 }
 
 fn strangers(location: &ArchiveLocation) -> ArchiveError {
@@ -145,6 +208,13 @@ mod tests {
         ArchiveLocation::new(storage, Some(CatalogLocation::File(file))).unwrap()
     }
 
+    async fn mark(storage: &dyn Storage) -> Mark {
+        match storage.read(IDENTITY, None).await {
+            Ok(bytes) => read_identity(&bytes).map_or(Mark::Damaged, Mark::Whole),
+            Err(_) => Mark::None,
+        }
+    }
+
     fn is_refused(opened: Result<VisualizationArchive, ArchiveError>) -> bool {
         match opened {
             Ok(_) => false,
@@ -164,9 +234,8 @@ mod tests {
                 assert!(!is_refused(VisualizationArchive::open(own).await));
             }
             let mixed = crossed(&one, &other);
-            // Who only reads knows nothing of two old ones; who writes looks closer, and leaves them alone.
-            let refused = is_refused(VisualizationArchive::open(&mixed).await);
-            assert_eq!(refused, !(old && other_old), "{old} {other_old}");
+            // Who writes leaves them alone.
+            assert!(is_refused(VisualizationArchive::open(&mixed).await));
             assert!(is_refused(VisualizationArchive::create(&mixed).await));
             for own in [&one, &other] {
                 for _ in 0..2 {
@@ -188,14 +257,78 @@ mod tests {
         assert!(!is_refused(
             VisualizationArchive::create(folder.path()).await
         ));
-        let again = of_storage(&**storage).await.unwrap();
-        assert_eq!(again, Some(identity.clone()));
+        assert_eq!(mark(&**storage).await, Mark::Whole(identity.clone()));
         // The other way round: one that the cache on disk made, of an archive that had none.
         catalog.forget_identity().await.unwrap();
         assert!(!is_refused(
             VisualizationArchive::create(folder.path()).await
         ));
         assert_eq!(catalog.identity().await.unwrap(), Some(identity));
+    }
+
+    /// Both ways to open it, with the catalog's file before and after.
+    async fn both_refuse(location: &ArchiveLocation, refused: impl Fn(&ArchiveError) -> bool) {
+        let CatalogLocation::File(file) = location.catalog() else {
+            panic!("a file")
+        };
+        let there = file.exists();
+        for opened in [
+            VisualizationArchive::open(location).await,
+            VisualizationArchive::create(location).await,
+        ] {
+            let error = opened.map(drop).unwrap_err();
+            assert!(refused(&error), "{error}");
+            let told = error.to_string();
+            for part in [location.storage().to_string(), file.display().to_string()] {
+                assert!(told.contains(&part), "{part:?} is not in: {told}");
+            }
+            assert_eq!(file.exists(), there, "nothing is left behind");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_damaged_identity_is_mended_where_pyramids_are_known() {
+        let whole = format!("{}\n", random());
+        for damaged in [
+            "",
+            "\n",
+            &whole[..20],
+            "not one of ours at all, but long",
+            "\0\0",
+        ] {
+            let folder = tempfile::tempdir().unwrap();
+            let (one, other) = (folder.path().join("one"), folder.path().join("other"));
+            made(&one, false).await;
+            made(&other, false).await;
+            let identity = |of: &Path| std::fs::read_to_string(of.join(IDENTITY)).unwrap();
+            let before = identity(&one);
+            std::fs::write(one.join(IDENTITY), damaged).unwrap();
+            // Who only reads changes nothing.
+            assert!(!is_refused(VisualizationArchive::open(&one).await));
+            assert_eq!(identity(&one), damaged);
+            // It is still no other's.
+            for opened in [
+                VisualizationArchive::open(&crossed(&other, &one)).await,
+                VisualizationArchive::create(&crossed(&other, &one)).await,
+            ] {
+                assert!(is_refused(opened));
+                assert_eq!(identity(&one), damaged);
+            }
+            assert!(!is_refused(VisualizationArchive::create(&one).await));
+            assert_eq!(identity(&one), before);
+            // Where nothing tells whose it is, it is told as what it is, and left alone.
+            let empty = folder.path().join("empty");
+            VisualizationArchive::create(&empty).await.unwrap();
+            std::fs::write(empty.join(IDENTITY), damaged).unwrap();
+            let told = |error: &ArchiveError| {
+                matches!(error, ArchiveError::Identity { .. })
+                    && error.to_string().contains("damaged")
+            };
+            both_refuse(&ArchiveLocation::from(&empty), told).await;
+            assert_eq!(identity(&empty), damaged);
+            std::fs::remove_file(empty.join(IDENTITY)).unwrap();
+            assert!(!is_refused(VisualizationArchive::create(&empty).await));
+        }
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

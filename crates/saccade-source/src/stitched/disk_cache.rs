@@ -27,8 +27,8 @@ use foyer::{
     BlockEngineConfig, DeviceBuilder, FsDeviceBuilder, HybridCache, HybridCacheBuilder, Load,
     PsyncIoEngineConfig, RecoverMode,
 };
-use saccade_archive::IDENTITY;
 use saccade_archive::storage::{Storage, StorageError};
+use saccade_archive::{IDENTITY, read_identity};
 
 /// Least unit in which the cache is written over \[bytes\]: several blocks of voxels. Each is a file.
 const UNIT: u64 = 64 << 20;
@@ -382,7 +382,14 @@ fn prepare(folder: &Path, units: Units) -> io::Result<Prepared> {
 /// What tells an archive from every other, made if it has none; `None` where it cannot be written.
 pub(super) async fn identity(storage: &dyn Storage) -> Option<Bytes> {
     match storage.read(IDENTITY, None).await {
-        Ok(identity) => return Some(identity),
+        Ok(identity) if read_identity(&identity).is_some() => return Some(identity),
+        Ok(_) => {
+            log::warn!(
+                "the cache on disk is not used: the archive's object {IDENTITY:?} is damaged; `saccade ingest` \
+                 writes it anew"
+            );
+            return None;
+        }
         Err(StorageError::NotFound { .. }) => {}
         Err(error) => {
             log::warn!("the cache on disk is not used: {error}");

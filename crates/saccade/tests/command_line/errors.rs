@@ -571,6 +571,28 @@ fn what_does_not_belong_together() {
     }
 }
 
+/// Neither another archive's nor none.
+#[test]
+fn an_identity_that_is_damaged() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = archive(folder.path());
+    let acquisition = folder.path().join("acquisition");
+    let ingest = ["ingest", text(&acquisition), &one, "--once"];
+    // Cut short while it was copied, say.
+    let identity = Path::new(&one).join("identity");
+    let said = std::fs::read_to_string(&identity).unwrap();
+    for damaged in ["", &said[..7]] {
+        std::fs::write(&identity, damaged).unwrap();
+        let told = stderr(&done(["check", &one]));
+        assert!(
+            told.contains("\"identity\"") && told.contains("damaged"),
+            "{told}"
+        );
+        done(ingest);
+        assert_eq!(std::fs::read_to_string(&identity).unwrap(), said);
+    }
+}
+
 #[test]
 fn what_an_export_finds_in_its_place() {
     let folder = tempfile::tempdir().unwrap();
