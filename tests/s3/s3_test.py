@@ -104,6 +104,11 @@ class S3(unittest.TestCase):
         self.assertIn(f"s3://{BUCKET}/{self.prefix}", done.stderr)
         self.complete()
         self.assertEqual(self.proxy.requests["PUT"], len(self.want) + 1, "one request a pyramid, and one for the mark")
+        fresh = self.work / "fresh.sqlite"
+        again = run("ingest", self.acquisition, self.archive[0], "--once", "--catalog", fresh)
+        self.assertEqual(again.returncode, 1, again.stderr)
+        self.assertIn("another catalog's", again.stderr)
+        self.assertFalse(fresh.exists(), "a catalog is left behind")
         self.proxy.requests.clear()
         self.proxy.latency = 0.02
         began = time.monotonic()

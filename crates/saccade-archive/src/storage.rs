@@ -78,6 +78,15 @@ pub trait Storage: Send + Sync + fmt::Debug {
     /// As they occur.
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>>;
 
+    /// Whether there is any, which takes less than to list them.
+    ///
+    /// # Errors
+    ///
+    /// As they occur.
+    fn holds_any<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<bool, StorageError>> {
+        async move { Ok(!self.entries(prefix).await?.is_empty()) }.boxed()
+    }
+
     /// Their names.
     ///
     /// # Errors

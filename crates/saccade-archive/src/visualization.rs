@@ -53,6 +53,19 @@ pub enum ArchiveError {
         /// Where the catalog is.
         catalog: CatalogLocation,
     },
+    /// There are pyramids, but the catalog knows of nothing.
+    #[error(
+        "{storage} holds pyramids, and the catalog {catalog} is not there or empty: they are another catalog's. \
+         Name that one, or another place for what is to be taken in. If their catalog was lost, put a copy of it \
+         back: `saccade ingest` goes on from what it knows. Without a copy, take the acquisition in again into \
+         another place; then these pyramids can be deleted"
+    )]
+    Unnamed {
+        /// Where the pyramids lie.
+        storage: StorageLocation,
+        /// Where the catalog is, or would be.
+        catalog: CatalogLocation,
+    },
     /// The storage's identity is damaged, and nothing else tells whose it is.
     #[error(
         "the object {IDENTITY:?} of {storage} is empty or damaged, and the catalog {catalog} names no pyramid by \
@@ -84,6 +97,10 @@ impl VisualizationArchive {
     /// [`ArchiveError`].
     pub async fn open(location: impl Into<ArchiveLocation>) -> Result<Self, ArchiveError> {
         let location = location.into();
+        // A bucket that is away, or somebody else's, is not to be asked on suspicion.
+        if location.folder().is_some() {
+            identity::refuse_without_catalog(&location).await?;
+        }
         match location.catalog() {
             CatalogLocation::File(file) if !file.is_file() => Err(ArchiveError::NotAnArchive {
                 path: file.to_owned(),
@@ -100,6 +117,7 @@ impl VisualizationArchive {
     /// [`ArchiveError`].
     pub async fn create(location: impl Into<ArchiveLocation>) -> Result<Self, ArchiveError> {
         let location = location.into();
+        identity::refuse_without_catalog(&location).await?;
         if let CatalogLocation::File(file) = location.catalog()
             && let Some(folder) = file.parent()
         {

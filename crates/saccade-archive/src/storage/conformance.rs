@@ -110,6 +110,16 @@ async fn lists_are_sorted_and_cut_by_prefix(storage: &dyn Storage) {
     assert_eq!(names(storage, "l/a").await, ["l/a/z"]);
     assert_eq!(names(storage, "l/a/z").await, ["l/a/z"]);
     assert_eq!(names(storage, "nothing/like/it").await, [""; 0]);
+    for (prefix, any) in [
+        ("l", true),
+        ("l/a/", true),
+        ("lone", true),
+        ("l/d", false),
+        ("no", false),
+    ] {
+        let held = storage.holds_any(prefix).await.expect("list");
+        assert_eq!(held, any, "{prefix}");
+    }
     let entries = storage.entries("l/a").await.expect("entries");
     assert_eq!(entries.len(), 1);
     assert_eq!((entries[0].name.as_str(), entries[0].size), ("l/a/z", 1));

@@ -131,6 +131,31 @@ impl LocalStorage {
         }
         .boxed()
     }
+
+    /// Objects whose names begin with `prefix`, at most so many, sorted by name.
+    fn list_some(
+        &self,
+        prefix: &str,
+        most: usize,
+    ) -> BoxFuture<'static, Result<Vec<Entry>, StorageError>> {
+        let (inner, prefix) = (self.0.clone(), prefix.to_owned());
+        async move {
+            let task = tokio::task::spawn_blocking(move || {
+                let mut found: Vec<Entry> = Vec::new();
+                let failed = |e| StorageError::new(e, &prefix, inner.root.display().to_string());
+                inner
+                    .walk(&inner.root, "", &prefix, most, &mut found)
+                    .map_err(failed)?;
+                found.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+                Ok(found)
+            });
+            task.await.unwrap_or_else(|e| {
+                let (source, path) = (io::Error::other(e), String::new());
+                Err(StorageError::Io { source, path })
+            })
+        }
+        .boxed()
+    }
 }
 
 impl Inner {
@@ -229,8 +254,16 @@ impl Inner {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Adds the files below `dir` to `found`; `at` is the folder's own name with a slash.
-    fn walk(&self, dir: &Path, at: &str, prefix: &str, found: &mut Vec<Entry>) -> io::Result<()> {
+    /// Adds the files below `dir` to `found`, until there are so many; `at` is the folder's own name with a
+    /// slash.
+    fn walk(
+        &self,
+        dir: &Path,
+        at: &str,
+        prefix: &str,
+        most: usize,
+        found: &mut Vec<Entry>,
+    ) -> io::Result<()> {
         let gone = |e: &io::Error| e.kind() == io::ErrorKind::NotFound;
         let entries = match self.disk.read_dir(dir) {
             // Removed since its parent was read.
@@ -238,6 +271,9 @@ impl Inner {
             entries => entries?,
         };
         for entry in entries {
+            if found.len() >= most {
+                break;
+            }
             let path = dir.join(&entry.name);
             let Ok(part) = entry.name.into_string() else {
                 continue;
@@ -249,7 +285,7 @@ impl Inner {
             if entry.is_dir {
                 let below = name + "/";
                 if below.starts_with(prefix) || prefix.starts_with(&below) {
-                    self.walk(&path, &below, prefix, found)?;
+                    self.walk(&path, &below, prefix, most, found)?;
                 }
             } else if name.starts_with(prefix) {
                 let metadata = match self.disk.metadata(&path) {
@@ -285,23 +321,11 @@ impl Storage for LocalStorage {
     }
 
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
-        let (inner, prefix) = (self.0.clone(), prefix.to_owned());
-        async move {
-            let task = tokio::task::spawn_blocking(move || {
-                let mut found: Vec<Entry> = Vec::new();
-                let failed = |e| StorageError::new(e, &prefix, inner.root.display().to_string());
-                inner
-                    .walk(&inner.root, "", &prefix, &mut found)
-                    .map_err(failed)?;
-                found.sort_unstable_by(|a, b| a.name.cmp(&b.name));
-                Ok(found)
-            });
-            task.await.unwrap_or_else(|e| {
-                let (source, path) = (io::Error::other(e), String::new());
-                Err(StorageError::Io { source, path })
-            })
-        }
-        .boxed()
+        self.list_some(prefix, usize::MAX)
+    }
+
+    fn holds_any<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<bool, StorageError>> {
+        async move { Ok(!self.list_some(prefix, 1).await?.is_empty()) }.boxed()
     }
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {

@@ -252,7 +252,8 @@ impl ObjectStorage {
         Ok(())
     }
 
-    async fn entries_below(&self, prefix: &str) -> Result<Vec<Entry>, StorageError> {
+    /// Objects whose names begin with `prefix`, at most so many, sorted by name.
+    async fn entries_below(&self, prefix: &str, most: usize) -> Result<Vec<Entry>, StorageError> {
         // Stores list whole folders; `prefix` may end within a name.
         let folder = prefix.rsplit_once('/').map_or("", |(folder, _)| folder);
         let folder: Path = self
@@ -273,6 +274,9 @@ impl ObjectStorage {
                     size: meta.size,
                     modified: Some(SystemTime::from(meta.last_modified)),
                 });
+                if entries.len() >= most {
+                    break;
+                }
             }
         }
         entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
@@ -298,7 +302,11 @@ impl Storage for ObjectStorage {
     }
 
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
-        self.entries_below(prefix).boxed()
+        self.entries_below(prefix, usize::MAX).boxed()
+    }
+
+    fn holds_any<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<bool, StorageError>> {
+        async move { Ok(!self.entries_below(prefix, 1).await?.is_empty()) }.boxed()
     }
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {

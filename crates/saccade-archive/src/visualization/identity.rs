@@ -3,17 +3,23 @@
 //! Both get the same random identity when the archive is made: the catalog in a table, the storage in an
 //! object. Where one of them has none, made by an earlier version or lost, or the object is damaged, it counts
 //! whether any of the pyramids that the catalog names are there.
+//!
+//! A catalog that knows of nothing does not belong to a storage that holds pyramids: they are another's, or their
+//! own catalog was lost. To take everything in again over them would change them under who still reads them.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 
 use bytes::Bytes;
 
 use super::{ArchiveError, ArchiveLocation};
-use crate::catalog::Catalog;
+use crate::catalog::{Catalog, CatalogLocation};
 use crate::storage::{Storage, StorageError};
 
 /// Name of the storage's object that holds the identity.
 pub const IDENTITY: &str = "identity";
+
+/// What the names of all pyramids begin with.
+pub(super) const PYRAMIDS: &str = "tiles/";
 
 /// Hexadecimal digits of an identity.
 const DIGITS: usize = 32;
@@ -90,6 +96,15 @@ async fn meet(
                 catalog: location.catalog().clone(),
             });
         }
+        let unused = catalog.volumes().await?.is_empty();
+        if unused && storage.holds_any(PYRAMIDS).await? {
+            // Unless another process has made the archive meanwhile.
+            let now = Parts::read(catalog, storage).await?;
+            return match now.agree() {
+                Some(true) => Ok(now),
+                _ => Err(unnamed(location)),
+            };
+        }
         return Ok(parts);
     }
     // Of several, one at least must be there.
@@ -155,8 +170,34 @@ pub(super) async fn make(
     Ok(())
 }
 
+/// Refuses a place that holds pyramids, but whose catalog is a file that is not there: before one is made, or what
+/// is wrong is said in other words.
+pub(super) async fn refuse_without_catalog(location: &ArchiveLocation) -> Result<(), ArchiveError> {
+    let CatalogLocation::File(file) = location.catalog() else {
+        return Ok(());
+    };
+    // Opening a folder makes it.
+    let folder = location.folder().map(|folder| folder.join(PYRAMIDS));
+    if file.exists() || folder.is_some_and(|folder| !folder.is_dir()) {
+        return Ok(());
+    }
+    let storage = location.storage().open().await?;
+    // Another process makes its catalog first, and then pyramids.
+    if storage.holds_any(PYRAMIDS).await? && !file.exists() {
+        return Err(unnamed(location));
+    }
+    Ok(())
+}
+
 fn strangers(location: &ArchiveLocation) -> ArchiveError {
     ArchiveError::Strangers {
+        storage: location.storage().clone(),
+        catalog: location.catalog().clone(),
+    }
+}
+
+fn unnamed(location: &ArchiveLocation) -> ArchiveError {
+    ArchiveError::Unnamed {
         storage: location.storage().clone(),
         catalog: location.catalog().clone(),
     }
@@ -172,7 +213,8 @@ mod tests {
 
     use super::*;
     use crate::VisualizationArchive;
-    use crate::catalog::{CatalogLocation, NewTile};
+    use crate::catalog::NewTile;
+    use crate::storage::LocalStorage;
 
     /// An archive of one tile, as an earlier version made it if it is to have no identity.
     async fn made(folder: &Path, old: bool) {
@@ -284,6 +326,54 @@ mod tests {
             }
             assert_eq!(file.exists(), there, "nothing is left behind");
         }
+    }
+
+    #[tokio::test]
+    async fn a_catalog_that_names_nothing_is_not_that_of_pyramids() {
+        for old in [false, true] {
+            let folder = tempfile::tempdir().unwrap();
+            let one = folder.path().join("one");
+            made(&one, old).await;
+            let unnamed = |error: &ArchiveError| matches!(error, ArchiveError::Unnamed { .. });
+            // Not there yet, made and empty, and lost.
+            both_refuse(&crossed(&folder.path().join("fresh"), &one), unnamed).await;
+            let empty = folder.path().join("empty");
+            let file = empty.join(VisualizationArchive::CATALOG);
+            std::fs::create_dir(&empty).unwrap();
+            Catalog::create(&file).await.unwrap().close().await;
+            both_refuse(&crossed(&empty, &one), unnamed).await;
+            let own = one.join(VisualizationArchive::CATALOG);
+            let kept = folder.path().join("kept");
+            std::fs::rename(&own, &kept).unwrap();
+            both_refuse(&ArchiveLocation::from(&one), unnamed).await;
+            // Its copy is as good as it was; and where there are no pyramids, anything may begin.
+            std::fs::rename(&kept, &own).unwrap();
+            assert!(!is_refused(VisualizationArchive::create(&one).await));
+            let storage = LocalStorage::new(&one).unwrap();
+            storage.delete("tiles/one").await.unwrap();
+            let begun = VisualizationArchive::create(&crossed(&empty, &one)).await;
+            assert!(!is_refused(begun));
+        }
+    }
+
+    #[tokio::test]
+    async fn another_catalog_with_a_volume_and_no_tiles_is_not_empty() {
+        let folder = tempfile::tempdir().unwrap();
+        let archive = VisualizationArchive::create(folder.path()).await.unwrap();
+        let volume = Volume::new("v", UVec3::ONE, DVec3::ONE).unwrap();
+        archive.catalog().create_volume(&volume).await.unwrap();
+        // As of an earlier version, which was killed before it entered its first pyramid.
+        let (catalog, storage) = (archive.catalog(), archive.storage());
+        storage
+            .write_durable("tiles/v/a", Bytes::from_static(b"x"))
+            .await
+            .unwrap();
+        storage.delete(IDENTITY).await.unwrap();
+        catalog.forget_identity().await.unwrap();
+        assert!(!is_refused(VisualizationArchive::open(folder.path()).await));
+        assert!(!is_refused(
+            VisualizationArchive::create(folder.path()).await
+        ));
     }
 
     #[tokio::test]

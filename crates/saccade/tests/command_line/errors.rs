@@ -571,13 +571,60 @@ fn what_does_not_belong_together() {
     }
 }
 
-/// Neither another archive's nor none.
+/// Pyramids whose catalog is another, or was lost.
 #[test]
-fn an_identity_that_is_damaged() {
+fn pyramids_of_which_the_catalog_knows_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let one = archive(folder.path());
     let acquisition = folder.path().join("acquisition");
     let ingest = ["ingest", text(&acquisition), &one, "--once"];
+    let own = Path::new(&one).join("catalog.sqlite");
+    let copy = folder.path().join("copy");
+    std::fs::copy(&own, &copy).unwrap();
+    let pyramids = || {
+        let listed = std::fs::read_dir(Path::new(&one).join("tiles")).unwrap();
+        listed.count()
+    };
+    let before = pyramids();
+
+    let fresh = folder.path().join("fresh.sqlite");
+    let output = run(ingest
+        .iter()
+        .chain(&["--catalog", text(&fresh), "--volume", "second"]));
+    let way_out = [
+        "another catalog's",
+        "Name that one",
+        "put a copy of it back",
+        "ingest",
+        &one,
+    ];
+    assert_failed(&output, 1, &way_out);
+    assert!(stderr(&output).contains(text(&fresh)));
+    assert!(!fresh.exists(), "no catalog is left behind");
+    assert_eq!(pyramids(), before, "nothing is taken in");
+
+    // More is taken in, and then the catalog is lost.
+    let records = acquisition.join("tiles.jsonl");
+    let said = std::fs::read_to_string(&records).unwrap();
+    let again = said.lines().next().unwrap();
+    let more = again.replace("\"tile\":\"", "\"tile\":\"later-");
+    std::fs::write(&records, format!("{said}{more}\n")).unwrap();
+    assert!(stderr(&done(ingest)).contains("1 tiles taken in"));
+    std::fs::remove_file(&own).unwrap();
+    for lost in [
+        &["serve", &one, "--port", "0"][..],
+        &["render", &one, "-o", "never.png"],
+        &["check", &one],
+        &ingest,
+    ] {
+        assert_failed(&run(lost), 1, &way_out);
+    }
+    // A copy knows less, and what is missing is taken in again.
+    std::fs::copy(&copy, &own).unwrap();
+    assert!(stderr(&done(ingest)).contains("1 tiles taken in"));
+    let whole = stderr(&done(["check", &one]));
+    assert!(whole.contains("all whole"), "{whole}");
+
     // Cut short while it was copied, say.
     let identity = Path::new(&one).join("identity");
     let said = std::fs::read_to_string(&identity).unwrap();
