@@ -15,13 +15,15 @@
 //! [`IngestOptions::attempts`] workers goes to quarantine.
 //!
 //! What cannot become a tile goes to the catalog's quarantine with the reason, and the next record
-//! is taken up. A file that is not whole yet is waited for, as long as it still changes.
+//! is taken up. A file that is not whole yet is waited for, as long as it still changes, and so are records that
+//! were cut shorter than what was read of them.
 
 mod enter;
 mod error;
 mod options;
 mod prepare;
 mod process;
+mod records;
 mod run;
 mod waiting;
 

@@ -175,6 +175,10 @@ impl RecordReader {
     /// The file's name in the archive.
     pub const FILE: &str = "tiles.jsonl";
 
+    /// Bytes from the beginning by which records are known as those that were read, if so many were: a file that is
+    /// cut shorter may be any.
+    pub const KNOWN_BY: u64 = HEAD as u64;
+
     /// A reader of an acquisition archive's records after `cursor`. Nothing is opened yet.
     pub fn new(folder: &Path, cursor: Cursor) -> Self {
         Self {
@@ -213,9 +217,9 @@ impl RecordReader {
     ///
     /// # Errors
     ///
-    /// [`AcquisitionError::Read`], [`AcquisitionError::RecordsCut`] for a file that got shorter, and
-    /// [`AcquisitionError::RecordsReplaced`] for one that begins otherwise, or holds other bytes before the
-    /// cursor, than what was read.
+    /// [`AcquisitionError::Read`], [`AcquisitionError::RecordsCut`] for a file that got shorter and, as far as can
+    /// be told, begins as it did, and [`AcquisitionError::RecordsReplaced`] for one that begins otherwise, or holds
+    /// other bytes before the cursor, than what was read.
     pub fn read(&mut self, max: usize) -> Result<Vec<RecordLine>, AcquisitionError> {
         self.read_lines(max)
             .map_err(|source| AcquisitionError::Read {
@@ -254,8 +258,17 @@ impl RecordReader {
         let len = file.metadata()?.len();
         let path = || self.path.clone();
         if len < offset {
+            let others = match seen {
+                Some(seen) if len >= Self::KNOWN_BY => {
+                    Prefix::read(&mut file, len)?.seen() >> 32 != seen >> 32
+                }
+                _ => false,
+            };
             let (read, path) = (offset, path());
-            return Ok(Err(AcquisitionError::RecordsCut { len, read, path }));
+            return Ok(Err(match others {
+                true => AcquisitionError::RecordsReplaced { line, path },
+                false => AcquisitionError::RecordsCut { len, read, path },
+            }));
         }
         let prefix = Prefix::read(&mut file, offset)?;
         if seen.is_some_and(|seen| seen != prefix.seen()) {
@@ -345,15 +358,17 @@ impl Prefix {
     /// Of a file's first `bytes`.
     fn read(file: &mut File, bytes: u64) -> io::Result<Self> {
         let mut prefix = Self::default();
-        let mut part = |from: u64, most: u64| {
+        // All of it: one that is cut meanwhile is not another.
+        let mut part = |from: u64, len: usize| {
             file.seek(SeekFrom::Start(from))?;
-            let mut part = Vec::new();
-            Read::by_ref(file).take(most).read_to_end(&mut part)?;
+            let mut part = vec![0; len];
+            file.read_exact(&mut part)?;
             Ok::<_, io::Error>(part)
         };
-        let tail = bytes.min(TAIL as u64);
-        prefix.push(&part(0, bytes.min(HEAD as u64))?);
-        prefix.tail = part(bytes - tail, tail)?;
+        let most = |most: usize| usize::try_from(bytes).map_or(most, |bytes| bytes.min(most));
+        prefix.push(&part(0, most(HEAD))?);
+        let tail = most(TAIL);
+        prefix.tail = part(bytes - tail as u64, tail)?;
         prefix.bytes = bytes;
         Ok(prefix)
     }
@@ -686,6 +701,31 @@ mod tests {
             reader.read(1),
             Err(AcquisitionError::RecordsCut { read: 9999, .. })
         ));
+    }
+
+    #[test]
+    fn records_that_were_cut_are_told_from_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(RecordReader::FILE);
+        let text = lines(300, |_| false);
+        std::fs::write(&path, &text).unwrap();
+        let mut reader = RecordReader::new(folder.path(), Cursor::default());
+        reader.read(usize::MAX).unwrap();
+        let other = lines(300, |n| n == 0);
+        for len in [0, 1, HEAD - 1, HEAD, HEAD + 1, text.len() - 1] {
+            std::fs::write(&path, &text[..len]).unwrap();
+            let cut = reader.read(1).unwrap_err();
+            assert!(
+                matches!(cut, AcquisitionError::RecordsCut { .. }),
+                "{len}: {cut}"
+            );
+            std::fs::write(&path, &other[..len]).unwrap();
+            let refused = reader.read(1).unwrap_err();
+            let known = matches!(refused, AcquisitionError::RecordsReplaced { line: 300, .. });
+            assert_eq!(known, len >= HEAD, "{len}: {refused}");
+        }
+        std::fs::write(&path, &text).unwrap();
+        assert_eq!(reader.read(1).unwrap(), []);
     }
 
     /// Of `count` lines, all as long as each other; `other` says which tiles are another acquisition's.

@@ -11,7 +11,7 @@ use futures::future::{Either, select};
 use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{
-    AcquisitionError, AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
+    AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
 };
 use saccade_archive::catalog::{CatalogError, Claim, Quarantined, Waiting, Worker};
 use saccade_core::volume::check_name;
@@ -19,7 +19,8 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, retry};
-use super::prepare::{Backoff, Context, Outcome, Stored, quarantine};
+use super::prepare::{Context, Outcome, Stored, quarantine};
+use super::records::patiently;
 use super::waiting::{Due, WaitingRoom};
 use super::{IngestError, IngestOptions, process};
 use crate::cancel::Cancel;
@@ -30,9 +31,6 @@ const LOOK_FOR_THE_DEAD: Duration = Duration::from_secs(1);
 
 /// Retired pyramids deleted per look.
 const DELETE_AT_ONCE: u32 = 64;
-
-/// Attempts at reading the records when all that is there is to be done once.
-const ATTEMPTS_ONCE: u32 = 4;
 
 /// Workers that ended with a record in hand, after which it is worked on alone, so that if it ends another, no
 /// other comes under suspicion.
@@ -479,32 +477,6 @@ impl Supply<'_> {
         let left = queued + lines.len() as u64 + self.reader.remaining_lines();
         self.left.store(left, Ordering::Relaxed);
         Ok(taken > 0)
-    }
-}
-
-/// Asks the records. A share that fails for a moment does not end the stream.
-async fn patiently<T>(
-    options: &IngestOptions,
-    progress: &dyn Progress,
-    mut ask: impl FnMut() -> Result<T, AcquisitionError>,
-) -> Result<T, IngestError> {
-    let mut backoff = Backoff::new(options.retry);
-    loop {
-        match ask() {
-            Ok(answer) => {
-                backoff.over(progress, "the records can be read again");
-                return Ok(answer);
-            }
-            Err(e) => {
-                // Who waits for the end is told, rather than kept.
-                let patient = !options.once || backoff.failures < ATTEMPTS_ONCE;
-                let passing = patient && matches!(e, AcquisitionError::Read { .. });
-                if !backoff.may_go_on(false, passing) {
-                    return Err(e.into());
-                }
-                backoff.say_and_wait(progress, &e).await;
-            }
-        }
     }
 }
 

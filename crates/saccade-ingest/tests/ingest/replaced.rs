@@ -30,6 +30,17 @@ fn acquired(prefix: &str, tiles: u32) -> Scope {
     scope
 }
 
+/// More of them.
+fn many(prefix: &str, tiles: u64) -> Scope {
+    let scope = Scope::new();
+    for n in 0..tiles {
+        let size = UVec2::new(9, 8);
+        let (section, seed) = (u32::try_from(n % 20).unwrap(), u8::try_from(n).unwrap());
+        scope.tile(&format!("{prefix}{n}"), section, size, seed);
+    }
+    scope
+}
+
 async fn refused(scope: &Path, archive: &VisualizationArchive) -> AcquisitionError {
     match run(scope, archive, &quick(), &(), &Cancel::new()).await {
         Err(IngestError::Acquisition(error)) => error,
@@ -231,6 +242,92 @@ async fn records_replaced_while_they_are_followed_end_it() {
         };
         assert!(noticed, "{count} in place {in_place}: {ended:?}");
         assert_eq!(seen(&archive).await.len(), 3);
+    }
+}
+
+/// As a copying program or an editor does it: cut to nothing, grown again, whole, and then longer.
+#[tokio::test]
+async fn records_that_are_written_anew_are_waited_for() {
+    // So many that they are known before they are whole, and so few that they are not.
+    for count in [3, 40] {
+        let (scope, folder) = (many("a", count), tempfile::tempdir().unwrap());
+        let archive = archive(folder.path()).await;
+        let options = IngestOptions {
+            once: false,
+            patience: 100_000,
+            ..quick()
+        };
+        let (diary, cancel) = (Diary::default(), Cancel::new());
+        let work = run(scope.path(), &archive, &options, &diary, &cancel);
+        let until = async |there: &dyn Fn() -> bool| {
+            while !there() {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        let taken_in = |tiles| diary.states().last().is_some_and(|s| s.tiles >= tiles);
+        let told = |what: &str| diary.notices().iter().filter(|n| n.contains(what)).count();
+        let rewrite = async {
+            until(&|| taken_in(count)).await;
+            let records = scope.path().join(RecordReader::FILE);
+            let text = fs::read(&records).unwrap();
+            for turn in 1..=2 {
+                fs::write(&records, "").unwrap();
+                until(&|| told("waited for") == turn).await;
+                assert!(diary.held_up().is_some(), "people see why it waits");
+                for len in [1, text.len() / 2, text.len() - 1] {
+                    fs::write(&records, &text[..len]).unwrap();
+                    tokio::time::sleep(Duration::from_millis(10)).await;
+                }
+                fs::write(&records, &text).unwrap();
+                until(&|| told("whole again") == turn).await;
+                assert_eq!(diary.held_up(), None);
+            }
+            scope.tile("later", 3, SIZE, 99);
+            until(&|| taken_in(count + 1)).await;
+            cancel.cancel();
+        };
+        let both = async { tokio::join!(work, rewrite) };
+        let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+        assert_eq!(both.expect("it goes on").0.unwrap().tiles, count + 1);
+    }
+}
+
+/// Not for ever; and what comes in their place is looked at once there is enough of it.
+#[tokio::test]
+async fn records_that_stay_cut_or_become_others_are_refused() {
+    for others in [false, true] {
+        let (scope, folder) = (many("a", 40), tempfile::tempdir().unwrap());
+        let archive = archive(folder.path()).await;
+        scope.ingest(&archive).await;
+        let records = scope.path().join(RecordReader::FILE);
+        let text = if others {
+            fs::read(many("b", 39).path().join(RecordReader::FILE)).unwrap()
+        } else {
+            fs::read(&records).unwrap()
+        };
+        fs::write(&records, &text[..text.len() - 200]).unwrap();
+        let options = IngestOptions {
+            once: false,
+            // Others are known at once.
+            patience: if others { 100_000_000 } else { 5 },
+            ..quick()
+        };
+        let (diary, cancel) = (Diary::default(), Cancel::new());
+        let work = run(scope.path(), &archive, &options, &diary, &cancel);
+        let ended = tokio::time::timeout(Duration::from_secs(60), work).await;
+        match ended.expect("it ends") {
+            Err(IngestError::Acquisition(AcquisitionError::RecordsReplaced {
+                line: 40, ..
+            })) => {
+                assert!(others);
+            }
+            Err(IngestError::Acquisition(AcquisitionError::RecordsCut { .. })) => {
+                assert!(!others);
+                assert_eq!(diary.notices().len(), 1, "{:?}", diary.notices());
+            }
+            other => panic!("{other:?}"),
+        }
+        assert_eq!(seen(&archive).await.len(), 40);
     }
 }
 
