@@ -20,6 +20,7 @@
 
 mod enter;
 mod error;
+mod images;
 mod options;
 mod prepare;
 mod process;

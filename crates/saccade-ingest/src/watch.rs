@@ -155,6 +155,14 @@ pub(crate) const BEFORE_FIRST: u32 = u32::MAX;
 /// Name of the link to the watched folder.
 const LINK: &str = "files";
 
+/// The path in the watched folder of a file that a record names: without the link, of which people know nothing.
+pub fn file_name(file: &str) -> &str {
+    let inside = file.strip_prefix(LINK);
+    inside
+        .and_then(|inside| inside.strip_prefix('/'))
+        .unwrap_or(file)
+}
+
 /// Pauses for which a file whose head cannot be read may stay as it is, before ingest is told and sets it
 /// aside.
 const PATIENCE: u32 = 120;
@@ -258,10 +266,8 @@ impl<F: Folders> Watch<F> {
                     break;
                 }
                 for line in lines {
-                    if let Ok(Record::Tile(tile)) = line.record
-                        && let Some(file) = tile.file.strip_prefix(LINK)
-                    {
-                        self.scanner.remember(file.trim_start_matches('/'));
+                    if let Ok(Record::Tile(tile)) = line.record {
+                        self.scanner.remember(file_name(&tile.file));
                     }
                 }
             }

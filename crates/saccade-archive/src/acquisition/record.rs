@@ -192,6 +192,13 @@ impl RecordReader {
         self.cursor
     }
 
+    /// A reader of the same records after another cursor.
+    #[must_use]
+    pub fn at(&self, cursor: Cursor) -> Self {
+        let path = self.path.clone();
+        Self { path, cursor }
+    }
+
     /// Looks whether what lies before the cursor is what was read; a cursor that does not know what that was
     /// learns it. Returns the cursor.
     ///

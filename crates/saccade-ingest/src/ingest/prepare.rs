@@ -7,9 +7,7 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
-use saccade_archive::acquisition::{
-    DeleteRecord, TileRecord, TransformRecord, image_path, is_inside,
-};
+use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord};
 use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
@@ -18,6 +16,7 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::IngestError;
+use super::images::Images;
 use crate::progress::Progress;
 use crate::watch::BEFORE_FIRST;
 
@@ -136,9 +135,8 @@ impl Stored {
 
 /// What all records share.
 pub(super) struct Context<'a> {
-    pub(super) folder: &'a Path,
-    /// Into which links may lead besides.
-    pub(super) linked: Option<&'a Path>,
+    /// Where the images are.
+    pub(super) images: Images<'a>,
     pub(super) volume: &'a str,
     pub(super) extent: UVec3,
     /// Names of the volume's channels.
@@ -156,16 +154,24 @@ impl Context<'_> {
         record: TileRecord,
         position: u64,
     ) -> Result<Outcome, IngestError> {
-        let Some(path) = image_path(self.folder, &record.file) else {
+        let refused = |reason, bytes| Ok(quarantine(self.images, &record, reason, bytes, None));
+        let watched = self.images.are_watched();
+        let Some(path) = self.images.path(&record.file) else {
             let reason = "the record names a file outside the acquisition archive; put the image \
                           into the archive and name it relative to its folder";
-            return Ok(quarantine(&record, reason.to_owned(), None, None));
+            return refused(reason.to_owned(), None);
         };
-        if !is_inside(&path, self.folder, self.linked) {
-            let reason = "the image is a link, or lies behind one, that leads out of the acquisition \
-                          archive; such links are not followed: put the image itself there, and append the \
-                          record again";
-            return Ok(quarantine(&record, reason.to_owned(), None, None));
+        if !self.images.hold(&path) {
+            let (out_of, then) = if watched {
+                ("watched folder", "")
+            } else {
+                ("acquisition archive", ", and append the record again")
+            };
+            let reason = format!(
+                "the image is a link, or lies behind one, that leads out of the {out_of}; such links are not \
+                 followed: put the image itself there{then}"
+            );
+            return refused(reason, None);
         }
         let (section, size, transform) = (record.section, record.size, record.transform);
         let before = look(&path);
@@ -176,47 +182,66 @@ impl Context<'_> {
                  the record again with the size of its image",
                 size.x, size.y,
             );
-            return Ok(quarantine(&record, reason, bytes, None));
+            return refused(reason, bytes);
         }
         if record.tile.trim().is_empty() {
             let reason = "the record's tile has no name, by which later records could speak of it; append \
                           it again with one";
-            return Ok(quarantine(&record, reason.to_owned(), bytes, None));
+            return refused(reason.to_owned(), bytes);
         }
         if !scale_is_sensible(transform) {
+            let check = if watched {
+                "--pixel: it is the size of a pixel in level-0 voxels"
+            } else {
+                "the transform: it leads to level-0 voxels"
+            };
             let reason = format!(
                 "a pixel of the tile would be larger than {LARGEST_PIXEL} voxels, or smaller than a \
-                 {LARGEST_PIXEL}th of one (transform {:?}); check the transform: it leads to level-0 voxels",
+                 {LARGEST_PIXEL}th of one (transform {:?}); check {check}",
                 transform.elements(),
             );
-            return Ok(quarantine(&record, reason, bytes, None));
+            return refused(reason, bytes);
         }
         if section == BEFORE_FIRST {
             let reason = "the number of its section is less than that of the first one; give the smallest with \
                           --first";
-            return Ok(quarantine(&record, reason.to_owned(), bytes, None));
+            return refused(reason.to_owned(), bytes);
         }
         if place(self.extent, section, size, transform).is_none() {
+            let check = if watched {
+                "its name, --first, --pitch and --extent"
+            } else {
+                "its section, transform and the extent in volume.json"
+            };
             let reason = format!(
                 "the tile lies wholly outside the volume of {} voxels (section {section}, transform \
-                 {:?}); check its section, transform and the extent in volume.json",
+                 {:?}); check {check}",
                 self.extent,
                 transform.elements(),
             );
-            return Ok(quarantine(&record, reason, bytes, None));
+            return refused(reason, bytes);
         }
         let Some(channel) = record.channel_among(self.channels) else {
-            let reason = format!(
-                "the volume has no such channel; it has {:?}: mend the record's channel and append it \
-                 again, or list the channel in the volume.json of a new acquisition",
-                self.channels,
-            );
-            return Ok(quarantine(&record, reason, bytes, None));
+            let mend = if watched {
+                "name the file as one of them, or take the folder in under another name (--volume NAME), with this \
+                 one among --channels as well"
+            } else {
+                "mend the record's channel and append it again, or list the channel in the volume.json of a new \
+                 acquisition"
+            };
+            let channels = self.channels;
+            let reason = format!("the volume has no such channel; it has {channels:?}: {mend}");
+            return refused(reason, bytes);
         };
         let name = pyramid_name(self.volume, &record, position);
         let pyramid = {
             let (path, record, stored) = (path.clone(), record.clone(), self.stored);
-            tokio::task::spawn_blocking(move || build(&path, &record, stored)).await
+            let work = move || build(&path, &record, stored, watched);
+            tokio::task::spawn_blocking(work).await
+        };
+        let unmade = |reason, name| {
+            let pyramid = Some(name);
+            Ok(quarantine(self.images, &record, reason, bytes, pyramid))
         };
         let wait = |reason, kind| {
             let waiting = Waiting {
@@ -234,22 +259,24 @@ impl Context<'_> {
             Ok(Ok(pyramid)) => pyramid,
             Ok(Err(Refusal::Incomplete(reason))) => return wait(reason, WaitKind::Incomplete),
             Ok(Err(Refusal::Broken(reason))) => return wait(reason, WaitKind::Broken),
-            Ok(Err(Refusal::Never(reason))) => {
-                return Ok(quarantine(&record, reason, bytes, Some(name)));
-            }
+            Ok(Err(Refusal::Never(reason))) => return unmade(reason, name),
             Err(panicked) => {
                 let reason = format!("decoding the image failed unexpectedly: {panicked}");
-                return Ok(quarantine(&record, reason, bytes, Some(name)));
+                return unmade(reason, name);
             }
         };
         let pyramid = match pyramid::named(pyramid, &name) {
             Ok(pyramid) => pyramid,
-            Err(e) => return Ok(quarantine(&record, e.to_string(), bytes, Some(name))),
+            Err(e) => return unmade(e.to_string(), name),
         };
         if let Err(occupied) = self.write(&record.tile, &name, pyramid).await? {
-            let reason =
-                format!("its pyramid cannot be written: {occupied}; then append the record again");
-            return Ok(quarantine(&record, reason, bytes, None));
+            let then = if watched {
+                "write the image again"
+            } else {
+                "append the record again"
+            };
+            let reason = format!("its pyramid cannot be written: {occupied}; then {then}");
+            return refused(reason, bytes);
         }
         let pixels = u64::from(size.x) * u64::from(size.y);
         let tile = NewTile {
@@ -313,18 +340,37 @@ enum Refusal {
     Never(String),
 }
 
-fn build(path: &Path, record: &TileRecord, stored: Stored) -> Result<Bytes, Refusal> {
+fn build(
+    path: &Path,
+    record: &TileRecord,
+    stored: Stored,
+    watched: bool,
+) -> Result<Bytes, Refusal> {
     // Reading a pipe waits for ever, and some devices never end.
     if fs::metadata(path).is_ok_and(|meta| !meta.is_file()) {
-        let reason = "this is no regular file (a folder, a pipe or a device); put the image itself \
-                      there, and append the record again";
-        return Err(Refusal::Never(reason.to_owned()));
+        let reason =
+            "this is no regular file (a folder, a pipe or a device); put the image itself there";
+        let then = if watched {
+            ""
+        } else {
+            ", and append the record again"
+        };
+        return Err(Refusal::Never(format!("{reason}{then}")));
     }
     let image = image::decode_file_as(path, stored.wanted(record.size)).map_err(|e| match e {
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
         // Of a file that is just being written, the head may be half there.
         ImageError::Broken { .. } | ImageError::TooLarge { .. } => Refusal::Broken(e.to_string()),
         ImageError::Read { ref source, .. } => Refusal::Incomplete(format!("{e}: {source}")),
+        // Who has neither volume.json nor records has options.
+        ImageError::Depth { bits, volume } if watched => Refusal::Never(format!(
+            "the image has {bits} bits per sample, but the volume has {volume}; convert it to {volume} bit grey, or \
+             take the folder in with other --bits under another name (--volume NAME)"
+        )),
+        ImageError::Size { width, height, .. } if watched => Refusal::Never(format!(
+            "the image has {width} x {height} pixels, but had others when it was found; rename whole images into \
+             the folder"
+        )),
         _ => Refusal::Never(e.to_string()),
     })?;
     stored
@@ -333,12 +379,13 @@ fn build(path: &Path, record: &TileRecord, stored: Stored) -> Result<Bytes, Refu
 }
 
 pub(super) fn quarantine(
+    images: Images<'_>,
     record: &TileRecord,
     reason: String,
     bytes: Option<u64>,
     pyramid: Option<String>,
 ) -> Outcome {
-    let (file, tile) = (record.file.clone(), Some(record.tile.clone()));
+    let (file, tile) = (images.name(&record.file), Some(record.tile.clone()));
     Outcome::Quarantine {
         what: Quarantined {
             file,

@@ -19,6 +19,7 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, retry};
+use super::images::Images;
 use super::prepare::{Context, Outcome, Stored, quarantine};
 use super::records::patiently;
 use super::waiting::{Due, WaitingRoom};
@@ -109,8 +110,7 @@ pub async fn run(
         archive,
         options,
         context: Context {
-            folder: acquisition,
-            linked: options.linked.as_deref(),
+            images: Images::new(acquisition, options.linked.as_deref()),
             volume: &volume.name,
             extent: volume.extent(),
             channels: &volume.channels,
@@ -214,8 +214,9 @@ enum Work {
 impl Ingest<'_> {
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
-            let due = self.room.due(self.context.folder, self.options.batch);
-            for notice in self.room.news() {
+            let images = self.context.images;
+            let due = self.room.due(images, self.options.batch);
+            for notice in self.room.news(images) {
                 self.context.progress.notice(&notice);
             }
             let due: VecDeque<_> = due.into_iter().map(Job::from).collect();
@@ -396,7 +397,7 @@ impl Supply<'_> {
         }
         for claim in claims {
             let deaths = claim.deaths;
-            let job = Job::claimed(claim, options);
+            let job = Job::claimed(claim, options, self.context.images);
             if deaths >= SUSPECT {
                 self.suspects.push(job);
             } else {
@@ -413,7 +414,7 @@ impl Supply<'_> {
         let (catalog, volume) = (self.archive.catalog(), self.context.volume);
         let from = retry(options, progress, || catalog.cursor(volume)).await?;
         if self.reader.cursor() != from {
-            *self.reader = RecordReader::new(self.context.folder, from);
+            *self.reader = self.reader.at(from);
         }
         patiently(options, progress, || self.reader.recognize()).await?;
         Ok(from)
@@ -574,7 +575,7 @@ impl From<Due> for Job {
 }
 
 impl Job {
-    fn claimed(claim: Claim, options: &IngestOptions) -> Self {
+    fn claimed(claim: Claim, options: &IngestOptions, images: Images<'_>) -> Self {
         let Claim {
             waiting: Waiting {
                 position, record, ..
@@ -583,11 +584,15 @@ impl Job {
             ..
         } = claim;
         let work = if deaths >= options.attempts {
+            let then = if images.are_watched() {
+                "write it again as another"
+            } else {
+                "append its record again"
+            };
             let reason = format!(
-                "{deaths} workers ended while they worked on it; look at the image, and append its \
-                 record again"
+                "{deaths} workers ended while they worked on it; look at the image, and {then}"
             );
-            Work::Done(quarantine(&record, reason, None, None))
+            Work::Done(quarantine(images, &record, reason, None, None))
         } else {
             Work::Tile(record)
         };

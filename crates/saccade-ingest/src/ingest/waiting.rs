@@ -1,12 +1,11 @@
 //! Files that are not whole yet: when to look again, when to give up.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 use std::time::Duration;
 
-use saccade_archive::acquisition::image_path;
 use saccade_archive::catalog::Waiting;
 
+use super::images::Images;
 use super::prepare::{Look, Outcome, WaitKind, look, quarantine};
 
 /// Longest pause between two looks at a file \[polls\].
@@ -90,7 +89,7 @@ impl WaitingRoom {
     }
 
     /// What to say of files that do not change, each once, and of many at once the first ones.
-    pub(super) fn news(&mut self) -> Vec<String> {
+    pub(super) fn news(&mut self, images: Images<'_>) -> Vec<String> {
         const AT_ONCE: usize = 3;
         // Most are whole a moment after their record.
         let patience = (self.patience / 15).max(2);
@@ -110,7 +109,8 @@ impl WaitingRoom {
             let Waiting { record, reason, .. } = &guest.waiting;
             told.push(format!(
                 "{} (tile {}) is waited for: {reason}",
-                record.file, record.tile
+                images.name(&record.file),
+                record.tile
             ));
         }
         if more > 0 {
@@ -125,7 +125,7 @@ impl WaitingRoom {
     }
 
     /// One more poll: the records to do something for, at most `max`.
-    pub(super) fn due(&mut self, folder: &Path, max: usize) -> Vec<Due> {
+    pub(super) fn due(&mut self, images: Images<'_>, max: usize) -> Vec<Due> {
         self.poll += 1;
         let poll = self.poll;
         let mut due = Vec::new();
@@ -133,7 +133,8 @@ impl WaitingRoom {
             if due.len() == max {
                 break;
             }
-            let now = image_path(folder, &guest.waiting.record.file).and_then(|path| look(&path));
+            let now = images.path(&guest.waiting.record.file);
+            let now = now.and_then(|path| look(&path));
             if guest.look != Some(now) {
                 // Not again before this attempt is over, which readmits it or lets it leave.
                 guest.next = u64::MAX;
@@ -158,16 +159,14 @@ impl WaitingRoom {
             } = &guest.waiting;
             let polls = u32::try_from(unchanged).unwrap_or(u32::MAX);
             let seconds = self.interval.saturating_mul(polls).as_secs_f64();
+            let again = images.again();
             let reason = match guest.kind {
                 WaitKind::Incomplete => format!(
-                    "{reason}. The file has not changed for {seconds:.1} s; once it is mended, \
-                     append its record again"
+                    "{reason}. The file has not changed for {seconds:.1} s; once it is mended, {again}"
                 ),
-                WaitKind::Broken => {
-                    format!("{reason}. Once the file is mended, append its record again")
-                }
+                WaitKind::Broken => format!("{reason}. Once the file is mended, {again}"),
             };
-            let outcome = quarantine(record, reason, now.map(|l| l.bytes), None);
+            let outcome = quarantine(images, record, reason, now.map(|l| l.bytes), None);
             due.push(Due::GiveUp {
                 position: *position,
                 outcome,
@@ -200,6 +199,10 @@ mod tests {
         }
     }
 
+    fn images(folder: &tempfile::TempDir) -> Images<'_> {
+        Images::new(folder.path(), None)
+    }
+
     fn room(patience: u32) -> WaitingRoom {
         WaitingRoom::new(patience, Duration::from_secs(1), Vec::new())
     }
@@ -211,9 +214,9 @@ mod tests {
             let mut room = room(patience);
             room.admit(waiting(5, "missing.tif"), None, WaitKind::Incomplete);
             for _ in 1..patience {
-                assert!(room.due(folder.path(), 9).is_empty());
+                assert!(room.due(images(&folder), 9).is_empty());
             }
-            let due = room.due(folder.path(), 9);
+            let due = room.due(images(&folder), 9);
             assert!(
                 matches!(due[..], [Due::GiveUp { position: 5, .. }]),
                 "{due:?}"
@@ -234,7 +237,7 @@ mod tests {
             if poll % 2 == 0 {
                 std::fs::write(&path, vec![0; poll + 1]).unwrap();
             }
-            for due in room.due(folder.path(), 9) {
+            for due in room.due(images(&folder), 9) {
                 let Due::Retry(waiting) = due else {
                     panic!("gave up at poll {poll}")
                 };
@@ -255,8 +258,8 @@ mod tests {
         room.admit(waiting(9, "broken.tif"), None, WaitKind::Broken);
         let mut told = Vec::new();
         for poll in 1..=40 {
-            assert!(room.due(folder.path(), 0).is_empty());
-            let now = room.news();
+            assert!(room.due(images(&folder), 0).is_empty());
+            let now = room.news(images(&folder));
             assert!(now.is_empty() || poll == 8, "poll {poll}: {now:?}");
             told.extend(now);
         }
@@ -266,8 +269,8 @@ mod tests {
         // Not again when it was tried again in vain.
         room.admit(waiting(1, "1.tif"), None, WaitKind::Incomplete);
         for _ in 0..40 {
-            room.due(folder.path(), 0);
-            assert!(room.news().is_empty());
+            room.due(images(&folder), 0);
+            assert!(room.news(images(&folder)).is_empty());
         }
     }
 
@@ -279,7 +282,7 @@ mod tests {
         let mut room = room(100);
         room.admit(waiting(5, "a.tif"), look(&path), WaitKind::Broken);
         assert!(matches!(
-            room.due(folder.path(), 9)[..],
+            room.due(images(&folder), 9)[..],
             [Due::GiveUp { .. }]
         ));
     }
@@ -289,13 +292,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let guests = vec![waiting(1, "a.tif"), waiting(2, "b.tif")];
         let mut room = WaitingRoom::new(9, Duration::from_secs(1), guests);
-        assert!(matches!(room.due(folder.path(), 1)[..], [Due::Retry(_)]));
+        assert!(matches!(room.due(images(&folder), 1)[..], [Due::Retry(_)]));
         assert!(
-            matches!(room.due(folder.path(), 9)[..], [Due::Retry(_)]),
+            matches!(room.due(images(&folder), 9)[..], [Due::Retry(_)]),
             "the other one"
         );
         assert!(
-            room.due(folder.path(), 9).is_empty(),
+            room.due(images(&folder), 9).is_empty(),
             "both are being tried"
         );
     }

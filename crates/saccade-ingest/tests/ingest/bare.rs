@@ -19,7 +19,9 @@ use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, run};
 use saccade_ingest::watch::{self, Disk, Watch, WatchConfig};
 
-use crate::scope::{Diary, VOLUME, archive, orphans, pixels, quick, seen, texture, tiff8};
+use crate::scope::{
+    Diary, VOLUME, archive, orphans, pixels, quick, seen, texture, tiff_rgb, tiff8, tiff16,
+};
 
 const SIZE: UVec2 = UVec2::new(140, 130);
 const FOLDER: &str = "SACCADE_TEST_BARE_FOLDER";
@@ -255,6 +257,81 @@ async fn a_full_disk_is_waited_out() {
     })
     .await;
     bare.is_clean(&archive, 0).await;
+}
+
+/// Whoever wrote the images knows neither of the records nor of where they are kept.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_said_of_an_image_is_of_the_folder_that_people_know() {
+    let mut bare = Bare::new();
+    let put = |bare: &mut Bare, n, bytes: &[u8]| {
+        let (path, _) = bare.file(n, 0);
+        let part = path.with_extension("part");
+        fs::write(&part, bytes).unwrap();
+        fs::rename(part, path).unwrap();
+    };
+    let whole = tiff8(SIZE, &texture(SIZE, 0));
+    put(&mut bare, 0, &whole[..whole.len() / 2]);
+    put(&mut bare, 1, &tiff_rgb(SIZE, [10, 200, 30]));
+    put(&mut bare, 2, &tiff16(SIZE));
+    bare.put(3, 7);
+    let gone = bare.file(4, 0).0;
+    bare.put(4, 0);
+    let far = bare.scope().join("s99/r0_c0.tif");
+    fs::create_dir(far.parent().unwrap()).unwrap();
+    fs::write(&far, &whole).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path()).await;
+    let diary = Diary::default();
+    let ingest = async |bare: &Bare, remove: bool| {
+        let mut watch = bare.watch();
+        watch::run(&mut watch, true, &Cancel::new()).unwrap();
+        if remove {
+            fs::remove_file(&gone).unwrap();
+        }
+        let options = IngestOptions {
+            linked: Some(watch.folder().to_owned()),
+            ..quick()
+        };
+        let (kept, cancel) = (bare.kept(), Cancel::new());
+        let done = run(&kept, &archive, &options, &diary, &cancel).await;
+        done.unwrap()
+    };
+    let done = ingest(&bare, true).await;
+    assert_eq!((done.tiles, done.quarantined), (1, 5));
+    let set_aside = archive.catalog().quarantined(VOLUME).await.unwrap();
+    let of = |file: &str| {
+        let one = set_aside.iter().find(|one| one.file == file);
+        &*one
+            .unwrap_or_else(|| panic!("{file}: {set_aside:?}"))
+            .reason
+    };
+    let gone = gone.to_str().unwrap();
+    for (file, parts) in [
+        ("s0/r0_c0.tif", &["rename it over this file"][..]),
+        ("s0/r0_c1.tif", &["colour"]),
+        ("s0/r0_c2.tif", &["16 bits", "--bits"]),
+        ("s0/r1_c1.tif", &[gone, "rename it over this file"]),
+        ("s99/r0_c0.tif", &["outside", "--first", "--extent"]),
+    ] {
+        for part in parts {
+            assert!(of(file).contains(part), "{part:?} is not in: {}", of(file));
+        }
+    }
+    let waited = "s0/r0_c0.tif (tile s0_r0_c0) is waited for";
+    let notices = diary.notices();
+    assert!(notices.iter().any(|n| n.starts_with(waited)), "{notices:?}");
+    let kept = bare.kept();
+    for word in ["files/", "record", "volume.json", kept.to_str().unwrap()] {
+        for told in notices
+            .iter()
+            .chain(set_aside.iter().map(|one| &one.reason))
+        {
+            assert!(!told.contains(word), "{word:?} is in: {told}");
+        }
+    }
+    // As it was told to.
+    put(&mut bare, 0, &whole);
+    assert_eq!(ingest(&bare, false).await.tiles, 1);
 }
 
 /// Two processes watch the same folder and ingest it into one archive; now one is killed, now the other, while

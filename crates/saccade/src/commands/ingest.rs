@@ -180,7 +180,12 @@ fn first<T>(all: &[T], say: impl Fn(&T) -> String) -> String {
 }
 
 /// What was set aside by this run, and what still waits.
-async fn say_what_is_left(catalog: &Catalog, volume: &str, quarantined: u64) -> Result<()> {
+async fn say_what_is_left(
+    catalog: &Catalog,
+    volume: &str,
+    quarantined: u64,
+    watched: bool,
+) -> Result<()> {
     if quarantined > 0 {
         let all = catalog.quarantined(volume).await?;
         let before = all.len().saturating_sub(usize::try_from(quarantined)?);
@@ -195,10 +200,12 @@ async fn say_what_is_left(catalog: &Catalog, volume: &str, quarantined: u64) -> 
     let waiting = catalog.waiting(volume).await?;
     if !waiting.is_empty() {
         let named = first(&waiting, |one| {
-            format!(
-                "{} (tile {}): {}",
-                one.record.file, one.record.tile, one.reason
-            )
+            let (record, reason) = (&one.record, &one.reason);
+            let file = match watched {
+                true => watch::file_name(&record.file),
+                false => &record.file,
+            };
+            format!("{file} (tile {}): {reason}", record.tile)
         });
         let count = waiting.len();
         say(&format!(
@@ -299,7 +306,8 @@ impl Ingest {
                 .map(|info| info.name),
         };
         if let Some(volume) = volume
-            && let Err(e) = say_what_is_left(archive.catalog(), &volume, quarantined).await
+            && let watched = options.linked.is_some()
+            && let Err(e) = say_what_is_left(archive.catalog(), &volume, quarantined, watched).await
         {
             log::warn!("what is left cannot be told: {e}");
         }
