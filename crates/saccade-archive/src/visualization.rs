@@ -55,8 +55,8 @@ pub enum ArchiveError {
     },
     /// There are pyramids, but the catalog knows of nothing.
     #[error(
-        "{storage} holds pyramids, and the catalog {catalog} is not there or empty: they are another catalog's. \
-         Name that one, or another place for what is to be taken in. If their catalog was lost, put a copy of it \
+        "{storage} holds pyramids, and the catalog {catalog} is not there or empty: they are another catalog's, or \
+         theirs was lost. Name that one, or another place for what is to be taken in. If it was lost, put a copy of it \
          back: `saccade ingest` goes on from what it knows. Without a copy, take the acquisition in again into \
          another place; then these pyramids can be deleted"
     )]
