@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use futures::future::BoxFuture;
-use futures::{FutureExt as _, StreamExt as _, TryStreamExt as _};
+use futures::{FutureExt as _, TryStreamExt as _};
 use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
 use object_store::limit::LimitStore;
 use object_store::path::Path;
@@ -26,6 +26,10 @@ use sort::{missing_object, sorted};
 const REQUESTS: usize = 64;
 /// How often a request is made again: for three seconds, if the store answers at once.
 const RETRIES: usize = 5;
+/// How often a listing is begun again at most.
+const LISTINGS: u32 = 4;
+/// Time before it is begun for the second time; twice as long before each time after that.
+const LISTING_PAUSE: Duration = Duration::from_millis(100);
 /// Settings of which one is there where requests can be signed, or need not be.
 const CREDENTIALS: [&str; 6] = [
     "aws_access_key_id",
@@ -154,11 +158,7 @@ impl ObjectStorage {
     ///
     /// [`StorageError::Refused`], [`StorageError::Unavailable`].
     pub async fn check(&self) -> Result<(), StorageError> {
-        let mut listed = self.store.list(Some(&self.prefix));
-        match listed.next().await {
-            Some(Err(e)) => Err(sorted(e, &self.location)),
-            Some(Ok(_)) | None => Ok(()),
-        }
+        self.entries_below("", 1).await.map(|_| ())
     }
 
     /// What the store calls an object. Characters that not all stores take are percent-encoded.
@@ -253,6 +253,8 @@ impl ObjectStorage {
     }
 
     /// Objects whose names begin with `prefix`, at most so many, sorted by name.
+    ///
+    /// A listing whose answer broke off is begun again: the client asks again only for requests that get none.
     async fn entries_below(&self, prefix: &str, most: usize) -> Result<Vec<Entry>, StorageError> {
         // Stores list whole folders; `prefix` may end within a name.
         let folder = prefix.rsplit_once('/').map_or("", |(folder, _)| folder);
@@ -261,10 +263,34 @@ impl ObjectStorage {
             .parts()
             .chain(Path::from(folder).parts())
             .collect();
-        let mut listed = self.store.list(Some(&folder));
+        let mut pause = LISTING_PAUSE;
+        let mut begun = 1;
+        loop {
+            match self.list_once(&folder, prefix, most).await {
+                Err(e) if e.is_outage() && begun < LISTINGS => begun += 1,
+                Err(e) => return Err(e),
+                Ok(mut entries) => {
+                    entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+                    return Ok(entries);
+                }
+            }
+            tokio::time::sleep(pause).await;
+            pause *= 2;
+        }
+    }
+
+    async fn list_once(
+        &self,
+        folder: &Path,
+        prefix: &str,
+        most: usize,
+    ) -> Result<Vec<Entry>, StorageError> {
+        let mut listed = self.store.list(Some(folder));
         let mut entries = Vec::new();
         let failed = |e| sorted(e, &self.location);
-        while let Some(meta) = listed.try_next().await.map_err(failed)? {
+        while entries.len() < most
+            && let Some(meta) = listed.try_next().await.map_err(failed)?
+        {
             let Some(name) = self.name(&meta.location) else {
                 continue;
             };
@@ -274,12 +300,8 @@ impl ObjectStorage {
                     size: meta.size,
                     modified: Some(SystemTime::from(meta.last_modified)),
                 });
-                if entries.len() >= most {
-                    break;
-                }
             }
         }
-        entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
         Ok(entries)
     }
 }

@@ -94,6 +94,15 @@ const WRITTEN: &str =
 const REST: &str = "HTTP/1.1 206 Partial Content\r\netag: \"a\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:00 GMT\r\ncontent-range: bytes 2-2/3\r\ncontent-length: 1\r\nconnection: close\r\n\r\nc";
 const SHORT: &str = "HTTP/1.1 200 OK\r\netag: \"a\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:00 GMT\r\ncontent-length: 3\r\nconnection: close\r\n\r\nab";
 
+const LIST: &str = concat!(
+    "HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n<ListBucketResult><IsTruncated>false</IsTruncated>",
+    "<Contents><Key>pre/x</Key><Size>3</Size><LastModified>2026-11-22T12:00:00.000Z</LastModified><ETag>\"a\"</ETag></Contents>",
+    "<Contents><Key>pre/y</Key><Size>4</Size><LastModified>2026-11-22T12:00:00.000Z</LastModified><ETag>\"b\"</ETag></Contents>",
+    "</ListBucketResult>"
+);
+const BROKEN_LIST: &str =
+    "HTTP/1.1 200 OK\r\ncontent-length: 900\r\nconnection: close\r\n\r\n<ListBucketResult><IsTrunc";
+
 #[tokio::test]
 async fn what_is_refused_is_not_asked_again_and_says_how_to_mend_it() {
     for (answer, advice) in [
@@ -147,6 +156,25 @@ async fn what_passes_is_asked_again() {
         .await
         .unwrap();
     assert_eq!(asked.load(Ordering::SeqCst), 3);
+}
+
+/// A listing that breaks off in its midst is whole in the end, or an outage; never a part of it.
+#[tokio::test]
+async fn listings_that_break_off_are_begun_again() {
+    let (url, asked) = server(vec![BROKEN_LIST, BROKEN_LIST, LIST]).await;
+    let listed = storage(&url, &[]).list("").await.unwrap();
+    assert_eq!(listed, ["x", "y"]);
+    assert_eq!(asked.load(Ordering::SeqCst), 3);
+    let (url, _) = server(vec![BROKEN_LIST, LIST]).await;
+    storage(&url, &[]).check().await.unwrap();
+    let (url, asked) = server(vec![BROKEN_LIST]).await;
+    let error = storage(&url, &[]).list("").await.unwrap_err();
+    assert!(error.is_outage(), "{error:?}");
+    assert!(asked.load(Ordering::SeqCst) >= 3);
+    let (url, asked) = server(vec![FORBIDDEN]).await;
+    let error = storage(&url, &[]).list("").await.unwrap_err();
+    assert!(matches!(error, StorageError::Refused { .. }), "{error:?}");
+    assert_eq!(asked.load(Ordering::SeqCst), 1);
 }
 
 #[tokio::test]
