@@ -10,7 +10,7 @@ use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{BrickVoxels, FrameReport, Renderer, View};
 
-use crate::clock::Stopwatch;
+use crate::clock::DrawClock;
 
 /// Bricks of any level.
 pub(crate) trait Bricks {
@@ -141,10 +141,10 @@ pub(crate) fn all_bricks(source: &(impl Bricks + Sync), ids: &[BrickId]) -> Vec<
     })
 }
 
-/// Time of one frame, from asking for it until the GPU has finished it \[ms\].
+/// What one frame takes, from asking for it until it is drawn \[ms\].
 pub(crate) fn frame_ms(renderer: &mut Renderer, view: &View) -> f64 {
-    let start = Stopwatch::start();
+    let start = DrawClock::start(renderer.gpu());
     renderer.render(view);
     pollster::block_on(renderer.finish());
-    start.elapsed().as_secs_f64() * 1e3
+    start.ms()
 }

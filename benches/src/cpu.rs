@@ -31,6 +31,19 @@ pub(crate) fn of_thread() -> Result<Duration> {
     )?))
 }
 
+/// The same of all threads of this process that have not ended, to the scheduler's ticks.
+pub(crate) fn of_threads() -> Result<Duration> {
+    let tasks = fs::read_dir("/proc/self/task").context("processor time needs /proc")?;
+    let mut sum = Duration::ZERO;
+    for task in tasks {
+        // A thread may have ended meanwhile.
+        let stat = fs::read_to_string(task?.path().join("schedstat")).unwrap_or_default();
+        let spent = stat.split_whitespace().next();
+        sum += Duration::from_nanos(spent.and_then(|n| n.parse().ok()).unwrap_or(0));
+    }
+    Ok(sum)
+}
+
 fn in_time(ticks: Option<u64>) -> Result<Duration> {
     let ticks = ticks.context("/proc/self/stat has an unknown form")?;
     Ok(Duration::from_millis(ticks * 1000 / TICKS_PER_SECOND))
@@ -64,6 +77,26 @@ mod tests {
         while of_thread().unwrap() - before < asleep + Duration::from_millis(20) {
             sum = std::hint::black_box(sum + 1);
         }
+    }
+
+    #[test]
+    fn threads_are_added() {
+        let before = of_threads().unwrap();
+        let work = || {
+            let start = of_thread().unwrap();
+            let mut sum = 0_u64;
+            while of_thread().unwrap() - start < Duration::from_millis(30) {
+                sum = std::hint::black_box(sum + 1);
+            }
+            of_threads().unwrap() - before
+        };
+        let here = work();
+        let with_another = std::thread::spawn(work).join().unwrap();
+        assert!(here >= Duration::from_millis(30), "{here:?}");
+        assert!(
+            with_another >= here + Duration::from_millis(30),
+            "{with_another:?}"
+        );
     }
 
     #[test]

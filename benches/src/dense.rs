@@ -6,7 +6,8 @@ use saccade_render::wgpu::util::DeviceExt as _;
 use saccade_render::{Gpu, View, wgpu};
 
 use crate::bricks::Arrays;
-use crate::clock::Stopwatch;
+use crate::clock::DrawClock;
+use crate::shader::shader_module;
 
 /// As `dense.wgsl` has it, each vector padded to four words.
 type Frame = [[f32; 4]; 7];
@@ -28,10 +29,7 @@ impl Dense {
         view: &View,
     ) -> Self {
         let device = gpu.device();
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some("dense"),
-            source: wgpu::ShaderSource::Wgsl(include_str!("dense.wgsl").into()),
-        });
+        let module = shader_module(device, "dense", include_str!("dense.wgsl"));
         let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some("dense"),
             layout: None,
@@ -133,9 +131,9 @@ impl Dense {
         }
     }
 
-    /// Time of one frame, from asking for it until the GPU has finished it \[ms\].
+    /// What one frame takes, from asking for it until it is drawn \[ms\].
     pub(crate) fn frame_ms(&self) -> f64 {
-        let start = Stopwatch::start();
+        let start = DrawClock::start(&self.gpu);
         let device = self.gpu.device();
         let mut encoder = device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         {
@@ -149,7 +147,7 @@ impl Dense {
         if let Err(error) = device.poll(wgpu::PollType::wait_indefinitely()) {
             log::error!("the device was lost: {error}");
         }
-        start.elapsed().as_secs_f64() * 1e3
+        start.ms()
     }
 
     /// The picture, RGBA.

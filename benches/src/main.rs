@@ -21,6 +21,7 @@ mod report;
 mod rows;
 mod scene;
 mod settings;
+mod shader;
 mod volumes;
 
 use std::fs;

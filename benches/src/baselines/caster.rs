@@ -14,6 +14,7 @@ use super::paged::Paged;
 use super::table::{Table, largest, single};
 use crate::bricks::{Bricks, all_bricks};
 use crate::clock::Stopwatch;
+use crate::shader::shader_module;
 
 /// As the shader has them.
 const COUNTERS: usize = 16;
@@ -533,10 +534,7 @@ pub(super) fn shader(method: Method, channels: usize) -> String {
 fn pipeline(gpu: &Gpu, method: Method, channels: usize) -> wgpu::ComputePipeline {
     let device = gpu.device();
     let source = shader(method, channels);
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some("baseline"),
-        source: wgpu::ShaderSource::Wgsl(source.into()),
-    });
+    let module = shader_module(device, "baseline", &source);
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some("baseline"),
         bind_group_layouts: &[Some(&layout(device))],

@@ -25,7 +25,7 @@ pub(crate) const PAGE_TABLES_IDS: &[&str] = &[
 
 /// Small enough for drivers that draw on the CPU.
 const SIZE: UVec2 = UVec2::new(160, 120);
-const RUNS: usize = 5;
+const RUNS: usize = 9;
 
 /// Ratios of pairs that were measured one right after the other.
 fn ratios(mut ours: impl FnMut() -> f64, mut theirs: impl FnMut() -> f64) -> [Vec<f64>; 3] {
