@@ -9,10 +9,10 @@ use saccade_core::volume::Volume;
 
 use crate::channel::ChannelView;
 use crate::layout::{
-    CHANNEL_RESIDENCY, CHANNEL_VALUES, ChannelUniform, DepthUniform, FLAG_FALSE_COLORS,
-    FLAG_JITTER, FLAG_NEAREST, FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform, HEAT_LOOKUPS,
-    HEAT_NODES, HEAT_NONE, HEAT_SAMPLES, LevelUniform, MODE_EMISSION_ABSORPTION, MODE_ISO_SURFACE,
-    MODE_MAXIMUM, MOST_CHANNELS, MOST_DEPTHS, MOST_PLANES, OctreeUniform,
+    CHANNEL_RESIDENCY, CHANNEL_VALUES, ChannelUniform, DepthUniform, FLAG_JITTER, FLAG_NEAREST,
+    FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform, HEAT_LOOKUPS, HEAT_NODES, HEAT_NONE, HEAT_SAMPLES,
+    LevelUniform, MODE_EMISSION_ABSORPTION, MODE_ISO_SURFACE, MODE_MAXIMUM, MOST_CHANNELS,
+    MOST_DEPTHS, MOST_PLANES, OctreeUniform,
 };
 use crate::memory::plan::Plan;
 use crate::octree::ResidencyOctree;
@@ -23,6 +23,8 @@ use crate::view::{Clip, HalfSpace, Mode, Slab, View, Work};
 const ANCHOR_REACH: f64 = 1e6;
 /// More levels than this finer or coarser make no sense.
 const MOST_BIAS: f32 = 32.0;
+/// Voxels from the eye up to which f32 places samples well: its steps there are a sixty-fourth of a voxel.
+const FAR_VOXELS: f32 = 262_144.0;
 /// Thickness of a slab that is to have none, of the finest voxel's shortest edge: one sample.
 const THIN: f64 = 1e-3;
 
@@ -147,7 +149,6 @@ pub(crate) fn frame_uniform(
         },
         down: (axes.y_axis * tangent).as_vec3(),
         flags: flag(view.substitute, FLAG_SUBSTITUTE)
-            | flag(view.false_colors, FLAG_FALSE_COLORS)
             | flag(view.jitter, FLAG_JITTER)
             | flag(values_hold, FLAG_OCTREE)
             | flag(volume.kind.is_labels(), FLAG_NEAREST),
@@ -191,7 +192,7 @@ fn octree_uniform(octree: &ResidencyOctree, eye_nm: DVec3, voxel_nm: DVec3) -> O
     }
     OctreeUniform {
         eye,
-        node_words: octree.node_words(),
+        slots: octree.slots(),
         anchor,
         cells_per_nm: (1.0 / cell_nm).as_vec3(),
         cells: geometry.cells,
@@ -211,6 +212,30 @@ fn anchored(position: DVec3, edge: f64, count: DVec3) -> (IVec3, Vec3) {
     let reach = DVec3::splat(ANCHOR_REACH);
     let anchor = (position / edge).floor().max(-reach).min(count + reach);
     (anchor.as_ivec3(), (position - anchor * edge).as_vec3())
+}
+
+/// Whether voxels may be sampled so far from the eye that f32 misplaces them by more than a quarter of their size, and with
+/// that perhaps in another brick than the one they are looked up in.
+pub(crate) fn is_far(frame: &FrameUniform) -> bool {
+    let corner = frame.low_nm.abs().max(frame.high_nm.abs());
+    let farthest = corner.length();
+    // Of a voxel's shortest edge.
+    let edges = |level: u32| {
+        let per_nm = frame.levels[level as usize].voxels_per_nm;
+        (
+            farthest * per_nm.max_element(),
+            per_nm.max_element() / per_nm.min_element(),
+        )
+    };
+    let channels = frame.channels.iter().take(frame.channel_count as usize);
+    channels.into_iter().any(|channel| {
+        let (finest, longest) = edges(channel.first_level);
+        let (coarsest, _) = edges(channel.last_level);
+        // A level is drawn where its voxels appear as large as a pixel, give or take the step to the next one, and a
+        // ray is longer than its depth by what is seen at an angle.
+        let by_level = 8.0 * longest / frame.pixel;
+        coarsest.max(finest.min(by_level)) >= FAR_VOXELS
+    })
 }
 
 /// The shader's name of a mode.
@@ -281,6 +306,32 @@ mod tests {
             (eye.as_vec3().as_dvec3() - eye).abs().max_element() > 1e-3,
             "f32 alone is not"
         );
+    }
+
+    #[test]
+    fn what_is_far_is_told() {
+        let mut frame = FrameUniform::zeroed();
+        frame.channel_count = 1;
+        frame.pixel = 1e-3;
+        frame.channels[0].last_level = 8;
+        for (n, level) in frame.levels.iter_mut().enumerate() {
+            level.voxels_per_nm = Vec3::new(0.2, 0.2, 0.02) / 2_f32.powi(i32::try_from(n).unwrap());
+        }
+        // Two million voxels wide: what is far is drawn from coarse levels.
+        frame.low_nm = Vec3::new(-10.0, -10.0, 1e4);
+        frame.high_nm = Vec3::splat(1e7);
+        assert!(!is_far(&frame));
+        // Where only the finest may be drawn it is.
+        frame.channels[0].last_level = 0;
+        assert!(is_far(&frame));
+        frame.high_nm = Vec3::splat(1e5);
+        assert!(!is_far(&frame));
+        // Where levels are drawn much finer than seen, too.
+        (frame.high_nm, frame.channels[0].last_level) = (Vec3::splat(1e7), 8);
+        frame.pixel = 1e-8;
+        assert!(is_far(&frame));
+        frame.channel_count = 0;
+        assert!(!is_far(&frame));
     }
 
     #[test]

@@ -9,8 +9,6 @@ pub(crate) const WORKGROUP: u32 = 8;
 
 /// Draw missing bricks from other levels.
 pub(crate) const FLAG_SUBSTITUTE: u32 = 1;
-/// Tint substitutes, fog over what is missing.
-pub(crate) const FLAG_FALSE_COLORS: u32 = 2;
 /// Sample segments at a place that differs by pixel.
 pub(crate) const FLAG_JITTER: u32 = 4;
 
@@ -75,20 +73,18 @@ pub(crate) const FEWEST_LOOKUPS: u32 = 10;
 pub(crate) const MOST_DEPTHS: usize = 24;
 /// Children of a node of the residency octree, kept side by side.
 pub(crate) const SIBLINGS: u32 = 8;
-/// Word of a node: block of its children, 0 where it has none.
-pub(crate) const NODE_CHILDREN: u32 = 0;
-/// First word of a node's first channel; the others follow.
-pub(crate) const NODE_CHANNEL: u32 = 1;
-/// Words of a channel.
-pub(crate) const NODE_CHANNEL_WORDS: u32 = 4;
-/// Word of a channel: a bit per eight stored values that samples may have.
+/// Texels in a row of the texture of nodes, of which each node has one per channel.
+pub(crate) const NODE_ROW: u32 = 4096;
+/// Words of a texel.
+pub(crate) const NODE_WORDS: u32 = 4;
+/// Word of a texel: a bit per eight stored values that samples may have.
 pub(crate) const NODE_BINS: u32 = 0;
-/// Word of a channel: smallest and largest stored value, 16 bits each.
+/// Word of a texel: smallest and largest stored value, 16 bits each.
 pub(crate) const NODE_RANGE: u32 = 1;
-/// Word of a channel: levels for whose samples bins and range hold, as bits.
+/// Word of a texel: levels for whose samples bins and range hold, as bits.
 pub(crate) const NODE_VALID: u32 = 2;
-/// Word of a channel: levels with a resident brick that overlaps the node, as bits.
-pub(crate) const NODE_RESIDENT: u32 = 3;
+/// Word of a texel, the same in all of a node: block of its children, 0 where it has none.
+pub(crate) const NODE_CHILDREN: u32 = 3;
 
 /// Misses a report has room for. Others are reported by a later frame.
 pub(crate) const MISSES: u32 = 4096;
@@ -126,7 +122,7 @@ pub(crate) struct DepthUniform {
 #[repr(C)]
 pub(crate) struct OctreeUniform {
     pub(crate) eye: Vec3,
-    pub(crate) node_words: u32,
+    pub(crate) slots: u32,
     pub(crate) anchor: IVec3,
     pub(crate) pad_0: u32,
     pub(crate) cells_per_nm: Vec3,
@@ -197,16 +193,23 @@ pub(crate) struct Variant {
     pub(crate) mode: u32,
     /// Whether voxels are two parts that are joined before they are interpolated.
     pub(crate) joined: bool,
+    /// Whether substitutes are tinted, and what is missing lies in fog.
+    pub(crate) tinted: bool,
+    /// Whether samples are kept within their bricks: numbers alone do not where voxels are too far away for f32.
+    pub(crate) bounded: bool,
 }
 
 impl Variant {
     /// For so many channels: variants are few, so that showing one channel more rarely compiles.
-    pub(crate) fn new(channels: usize, mode: u32, joined: bool) -> Self {
+    pub(crate) fn new(channels: usize, mode: u32, joined: bool, tinted: bool, far: bool) -> Self {
         let channels = u32::try_from(channels).expect("a few channels");
         Self {
             slots: channels.max(1).next_power_of_two(),
             mode,
             joined,
+            tinted,
+            // What lies around a surface is sampled as well, up to a voxel further.
+            bounded: far || mode == MODE_ISO_SURFACE,
         }
     }
 }
@@ -217,6 +220,8 @@ pub(crate) fn ray_cast(variant: Variant) -> String {
         slots,
         mode,
         joined,
+        tinted,
+        bounded,
     } = variant;
     // With one channel there is nothing to count.
     let count = if slots == 1 {
@@ -225,7 +230,7 @@ pub(crate) fn ray_cast(variant: Variant) -> String {
         "frame.channel_count | nothing"
     };
     format!(
-        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\n\
+        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\nconst TINTED = {tinted};\nconst BOUNDED = {bounded};\n\
          fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}"
     )
 }
@@ -249,12 +254,13 @@ mod tests {
     use saccade_core::transfer::TABLE_LEN;
     use std::mem::{offset_of, size_of};
 
-    const VARIANTS: [(usize, u32, bool); 5] = [
-        (1, MODE_EMISSION_ABSORPTION, false),
-        (1, MODE_MAXIMUM, true),
-        (1, MODE_ISO_SURFACE, false),
-        (2, MODE_EMISSION_ABSORPTION, true),
-        (16, MODE_ISO_SURFACE, false),
+    const VARIANTS: [(usize, u32, bool, bool, bool); 6] = [
+        (1, MODE_EMISSION_ABSORPTION, false, false, false),
+        (1, MODE_EMISSION_ABSORPTION, false, false, true),
+        (1, MODE_MAXIMUM, true, true, false),
+        (1, MODE_ISO_SURFACE, false, false, false),
+        (2, MODE_EMISSION_ABSORPTION, true, true, true),
+        (16, MODE_ISO_SURFACE, false, true, false),
     ];
 
     fn parsed(source: &str) -> naga::Module {
@@ -263,17 +269,19 @@ mod tests {
     }
 
     fn module() -> naga::Module {
-        parsed(&ray_cast(Variant::new(1, MODE_EMISSION_ABSORPTION, false)))
+        let [joined, tinted, far] = [false; 3];
+        let variant = Variant::new(1, MODE_EMISSION_ABSORPTION, joined, tinted, far);
+        parsed(&ray_cast(variant))
     }
 
     #[test]
     fn every_shader_is_valid_without_any_optional_feature() {
-        for (channels, mode, joined) in VARIANTS {
+        for (channels, mode, joined, tinted, far) in VARIANTS {
             let mut validator = naga::valid::Validator::new(
                 naga::valid::ValidationFlags::all(),
                 naga::valid::Capabilities::empty(),
             );
-            let source = ray_cast(Variant::new(channels, mode, joined));
+            let source = ray_cast(Variant::new(channels, mode, joined, tinted, far));
             let module = parsed(&source);
             validator
                 .validate(&module)
@@ -336,7 +344,6 @@ mod tests {
             ("FIRST_SLOT", Entry::FIRST_SLOT),
             ("STALE", Entry::STALE),
             ("FLAG_SUBSTITUTE", FLAG_SUBSTITUTE),
-            ("FLAG_FALSE_COLORS", FLAG_FALSE_COLORS),
             ("FLAG_JITTER", FLAG_JITTER),
             ("FLAG_OCTREE", FLAG_OCTREE),
             ("FLAG_NEAREST", FLAG_NEAREST),
@@ -356,13 +363,11 @@ mod tests {
             ("FEWEST_LOOKUPS", FEWEST_LOOKUPS),
             ("MOST_DEPTHS", u32::try_from(MOST_DEPTHS).unwrap()),
             ("SIBLINGS", SIBLINGS),
-            ("NODE_CHILDREN", NODE_CHILDREN),
-            ("NODE_CHANNEL", NODE_CHANNEL),
-            ("NODE_CHANNEL_WORDS", NODE_CHANNEL_WORDS),
+            ("NODE_ROW", NODE_ROW),
             ("NODE_BINS", NODE_BINS),
             ("NODE_RANGE", NODE_RANGE),
             ("NODE_VALID", NODE_VALID),
-            ("NODE_RESIDENT", NODE_RESIDENT),
+            ("NODE_CHILDREN", NODE_CHILDREN),
             ("COUNT_NODES", COUNT_NODES),
             ("COUNTERS", COUNTERS),
             ("COUNT_MISSES", COUNT_MISSES),
@@ -456,7 +461,7 @@ mod tests {
         let octree = rust_struct!(
             OctreeUniform,
             eye,
-            node_words,
+            slots,
             anchor,
             cells_per_nm,
             cells,

@@ -44,11 +44,12 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         has_dynamic_offset: false,
         min_binding_size: None,
     };
-    let texture = |view_dimension, filterable| wgpu::BindingType::Texture {
-        sample_type: wgpu::TextureSampleType::Float { filterable },
+    let texture = |view_dimension, sample_type| wgpu::BindingType::Texture {
+        sample_type,
         view_dimension,
         multisampled: false,
     };
+    let float = |filterable| wgpu::TextureSampleType::Float { filterable };
     let types = [
         wgpu::BindingType::Buffer {
             ty: wgpu::BufferBindingType::Uniform,
@@ -60,14 +61,18 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         storage(true),
         storage(false),
         storage(false),
-        texture(wgpu::TextureViewDimension::D2, false),
-        texture(wgpu::TextureViewDimension::D3, true),
+        texture(wgpu::TextureViewDimension::D2, float(false)),
+        texture(wgpu::TextureViewDimension::D3, float(true)),
         wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
         wgpu::BindingType::StorageTexture {
             access: wgpu::StorageTextureAccess::WriteOnly,
             format: IMAGE_FORMAT,
             view_dimension: wgpu::TextureViewDimension::D2,
         },
+        texture(
+            wgpu::TextureViewDimension::D2,
+            wgpu::TextureSampleType::Uint,
+        ),
         storage(true),
     ];
     let entries = (0..)
@@ -84,15 +89,28 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
     })
 }
 
+/// Compiles the ray-caster without counters that end its loops, which cost as much as what they count: each loop ends
+/// by itself, as a ray comes to its end whatever it meets, nodes have so many depths, and there are so many levels, channels and bricks.
+#[expect(unsafe_code, reason = "loops of our own that end need no counters")]
+fn shader_module(device: &wgpu::Device, variant: Variant) -> wgpu::ShaderModule {
+    let descriptor = wgpu::ShaderModuleDescriptor {
+        label: Some("ray-caster"),
+        source: wgpu::ShaderSource::Wgsl(ray_cast(variant).into()),
+    };
+    let checks = wgpu::ShaderRuntimeChecks {
+        force_loop_bounding: false,
+        ..wgpu::ShaderRuntimeChecks::checked()
+    };
+    // SAFETY: No loop is infinite (see above), and all other checks stay.
+    unsafe { device.create_shader_module_trusted(descriptor, checks) }
+}
+
 fn pipeline(
     device: &wgpu::Device,
     layout: &wgpu::BindGroupLayout,
     variant: Variant,
 ) -> wgpu::ComputePipeline {
-    let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-        label: Some("ray-caster"),
-        source: wgpu::ShaderSource::Wgsl(ray_cast(variant).into()),
-    });
+    let module = shader_module(device, variant);
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some("ray-caster"),
         bind_group_layouts: &[Some(layout)],

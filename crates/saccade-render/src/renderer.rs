@@ -12,10 +12,10 @@ use saccade_core::voxel_box::VoxelBox;
 
 use crate::channel::{self, ChannelError, ChannelView};
 use crate::delivery::{BrickVoxels, Delivery, DeliveryError, Freshness};
-use crate::frame::{Scene, Seen, frame_uniform, mode_of};
+use crate::frame::{Scene, Seen, frame_uniform, is_far, mode_of};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
-use crate::layout::{MOST_CHANNELS, NODE_CHANNEL, NODE_CHANNEL_WORDS, Variant};
+use crate::layout::{MOST_CHANNELS, Variant};
 use crate::memory::plan::{DeviceLimits, Misfit, Needs, OctreeSize, Plan, READBACKS};
 use crate::memory::pressure::Pressure;
 use crate::memory::{Frame, Placement, VirtualMemory, Want};
@@ -132,6 +132,7 @@ impl Renderer {
         }
         let device = DeviceLimits {
             texture_edge: limits.max_texture_dimension_3d,
+            rows: limits.max_texture_dimension_2d,
             buffer: limits
                 .max_buffer_size
                 .min(limits.max_storage_buffer_binding_size),
@@ -143,7 +144,7 @@ impl Renderer {
         });
         let octree_size = OctreeSize {
             blocks: octree.as_ref().map_or(0, Geometry::all_blocks),
-            node_words: NODE_CHANNEL + octree_slots * NODE_CHANNEL_WORDS,
+            slots: octree_slots,
         };
         let needs = Needs {
             octree: octree_size,
@@ -311,7 +312,9 @@ impl Renderer {
         });
         if let Some(octree) = &mut self.octree {
             octree.advance(NODES_PER_FRAME);
-            octree.flush(|first, words| resources.write_nodes(gpu, first, words));
+            octree.flush(|first, texels, resident| {
+                resources.write_nodes(gpu, first, texels, resident);
+            });
         }
         let scene = Scene {
             volume: &self.volume,
@@ -330,6 +333,8 @@ impl Renderer {
             self.channels.len(),
             mode_of(self.mode),
             self.format.is_joined(),
+            view.false_colors,
+            is_far(&uniform),
         );
         let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());
         let target = readback.as_ref().map(|r| r.staging.buffer());

@@ -1,11 +1,13 @@
 //! What a renderer has on the device: caches, buffers, the picture.
 
+use std::ops::Range;
+
 use glam::{UVec2, UVec3};
 use saccade_core::brick::BRICK_STORED_EDGE;
 use saccade_core::transfer::TABLE_LEN;
 
 use crate::gpu::Gpu;
-use crate::layout::{FrameUniform, MOST_CHANNELS, Variant, WORKGROUP};
+use crate::layout::{FrameUniform, MOST_CHANNELS, NODE_ROW, Variant, WORKGROUP};
 use crate::memory::plan::Plan;
 use crate::memory::{Array, Entry};
 use crate::ray_caster::IMAGE_FORMAT;
@@ -18,7 +20,8 @@ pub(crate) struct Resources {
     frame_stride: u32,
     directory: wgpu::Buffer,
     tables: wgpu::Buffer,
-    nodes: wgpu::Buffer,
+    nodes: wgpu::Texture,
+    residents: wgpu::Buffer,
     slot_ranges: wgpu::Buffer,
     missed: wgpu::Buffer,
     report: wgpu::Buffer,
@@ -61,7 +64,8 @@ impl Resources {
         );
         let directory = words("page directory", plan.directory, storage | copy_dst);
         let tables = words("page table cache", plan.table_entries(), storage | copy_dst);
-        let nodes = buffer(device, "octree", plan.octree_bytes(), storage | copy_dst);
+        let nodes = nodes_texture(device, plan.node_rows());
+        let residents = words("residents", plan.node_texels(), storage | copy_dst);
         let slot_ranges = words("slot ranges", plan.bricks(), storage | copy_dst);
         let missed = words("missed", plan.mask_words(), storage | copy_dst);
         let report_usage = storage | copy_dst | wgpu::BufferUsages::COPY_SRC;
@@ -89,6 +93,7 @@ impl Resources {
             directory,
             tables,
             nodes,
+            residents,
             slot_ranges,
             missed,
             report,
@@ -110,6 +115,9 @@ impl Resources {
         let colors = self
             .colors
             .create_view(&wgpu::TextureViewDescriptor::default());
+        let nodes = self
+            .nodes
+            .create_view(&wgpu::TextureViewDescriptor::default());
         let frame = wgpu::BufferBinding {
             buffer: &self.frames,
             offset: 0,
@@ -126,7 +134,8 @@ impl Resources {
             wgpu::BindingResource::TextureView(&bricks),
             wgpu::BindingResource::Sampler(&self.sampler),
             wgpu::BindingResource::TextureView(&view),
-            self.nodes.as_entire_binding(),
+            wgpu::BindingResource::TextureView(&nodes),
+            self.residents.as_entire_binding(),
         ];
         let entries = (0..).zip(resources);
         let entries = entries.map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource });
@@ -171,12 +180,31 @@ impl Resources {
             .write_buffer(buffer, u64::from(first) * 4, bytemuck::cast_slice(entries));
     }
 
-    pub(crate) fn write_nodes(&self, gpu: &Gpu, first: u32, words: &[u32]) {
-        gpu.queue().write_buffer(
-            &self.nodes,
-            u64::from(first) * 4,
-            bytemuck::cast_slice(words),
-        );
+    /// Writes what nodes know, from a texel on: a channel of a node each.
+    pub(crate) fn write_nodes(&self, gpu: &Gpu, first: u32, texels: &[[u32; 4]], resident: &[u32]) {
+        let at = u64::from(first) * 4;
+        let resident = bytemuck::cast_slice(resident);
+        gpu.queue().write_buffer(&self.residents, at, resident);
+        for (rows, range) in rows_of(first, texels.len(), NODE_ROW) {
+            let target = wgpu::TexelCopyTextureInfo {
+                texture: &self.nodes,
+                mip_level: 0,
+                origin: wgpu::Origin3d {
+                    x: rows.x,
+                    y: rows.y,
+                    z: 0,
+                },
+                aspect: wgpu::TextureAspect::All,
+            };
+            let layout = wgpu::TexelCopyBufferLayout {
+                offset: 0,
+                bytes_per_row: Some(rows.width * size_u32::<[u32; 4]>()),
+                rows_per_image: None,
+            };
+            let size = extent(UVec3::new(rows.width, rows.height, 1));
+            let texels = bytemuck::cast_slice(&texels[range]);
+            gpu.queue().write_texture(target, texels, layout, size);
+        }
     }
 
     /// Writes a brick with its border, and the range of its values.
@@ -282,6 +310,54 @@ fn buffer(
     })
 }
 
+/// A texel per channel of each node.
+fn nodes_texture(device: &wgpu::Device, rows: u32) -> wgpu::Texture {
+    device.create_texture(&wgpu::TextureDescriptor {
+        label: Some("octree"),
+        size: extent(UVec3::new(NODE_ROW, rows.max(1), 1)),
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format: wgpu::TextureFormat::Rgba32Uint,
+        usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+        view_formats: &[],
+    })
+}
+
+/// A rectangle of a texture whose texels are numbered row by row.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Rows {
+    x: u32,
+    y: u32,
+    width: u32,
+    height: u32,
+}
+
+/// Texels in a row, as rectangles, each with which of them it holds: three at most.
+fn rows_of(first: u32, count: usize, row: u32) -> Vec<(Rows, Range<usize>)> {
+    let mut parts = Vec::with_capacity(3);
+    let mut done = 0;
+    while done < count {
+        let at = first + u32::try_from(done).expect("fewer than a texture holds");
+        let left = u32::try_from(count - done).expect("fewer than a texture holds");
+        let (x, y) = (at % row, at / row);
+        let (width, height) = match x == 0 && left >= row {
+            true => (row, left / row),
+            false => (left.min(row - x), 1),
+        };
+        let next = done + (width * height) as usize;
+        let rows = Rows {
+            x,
+            y,
+            width,
+            height,
+        };
+        parts.push((rows, done..next));
+        done = next;
+    }
+    parts
+}
+
 /// A row of colours per channel. A texture, since drivers that draw on the CPU read a buffer value by value.
 fn colors_texture(device: &wgpu::Device) -> wgpu::Texture {
     let [width, height] = [TABLE_LEN, MOST_CHANNELS].map(|n| u32::try_from(n).expect("a few"));
@@ -310,4 +386,32 @@ fn image_texture(device: &wgpu::Device, size: UVec2) -> wgpu::Texture {
             | wgpu::TextureUsages::COPY_SRC,
         view_formats: &[],
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texels_in_a_row_are_as_few_rectangles() {
+        for first in 0..23 {
+            for count in 0..40 {
+                let parts = rows_of(first, count, 7);
+                assert!(parts.len() <= 3, "{first} {count}: {parts:?}");
+                let texels = parts.iter().flat_map(|(rows, range)| {
+                    let (x, width) = (rows.x, rows.width);
+                    assert!(x + width <= 7);
+                    let numbers = (rows.y..rows.y + rows.height)
+                        .flat_map(move |y| (x..x + width).map(move |x| y * 7 + x));
+                    let numbers: Vec<_> = numbers.collect();
+                    assert_eq!(numbers.len(), range.len());
+                    numbers
+                });
+                let end = first + u32::try_from(count).unwrap();
+                assert!(texels.eq(first..end), "{first} {count}: {parts:?}");
+                let ranges = parts.iter().flat_map(|(_, range)| range.clone());
+                assert!(ranges.eq(0..count));
+            }
+        }
+    }
 }

@@ -4,7 +4,7 @@ use glam::UVec3;
 use saccade_core::brick::{BRICK_STORED_EDGE, BRICK_STORED_VOXELS};
 use saccade_core::page_table::PageTables;
 
-use crate::layout::{COUNTERS, MISSES, SIBLINGS};
+use crate::layout::{COUNTERS, MISSES, NODE_ROW, NODE_WORDS, SIBLINGS};
 
 /// Readbacks in flight at once; each has a buffer of its own.
 pub(crate) const READBACKS: u64 = 3;
@@ -19,14 +19,18 @@ const TABLE_SHARE: u64 = 16;
 const OCTREE_SHARE: u64 = 16;
 /// Blocks of nodes that every octree gets, if it has so many.
 const LEAST_NODE_BLOCKS: u64 = 64;
+/// What a node knows of the values of a channel.
+const TEXEL_BYTES: u64 = 4 * NODE_WORDS as u64;
+/// What it knows of the bricks of a channel.
+const RESIDENT_BYTES: u64 = 4;
 
 /// What a residency octree has use for.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct OctreeSize {
     /// Blocks of eight nodes, grown everywhere.
     pub(crate) blocks: u64,
-    /// Words of a node.
-    pub(crate) node_words: u32,
+    /// Channels that a node knows of.
+    pub(crate) slots: u32,
 }
 
 /// What bricks and tables are for.
@@ -43,6 +47,8 @@ pub(crate) struct Needs {
 pub(crate) struct DeviceLimits {
     /// Edge of a 3D texture \[texels\].
     pub(crate) texture_edge: u32,
+    /// Edge of a 2D texture \[texels\].
+    pub(crate) rows: u32,
     /// Size of a storage buffer \[bytes\].
     pub(crate) buffer: u64,
 }
@@ -58,7 +64,7 @@ pub(crate) struct Plan {
     pub(crate) directory: u32,
     /// Blocks of eight nodes of the residency octree.
     pub(crate) node_blocks: u32,
-    node_words: u32,
+    slots: u32,
     voxel_bytes: u32,
     block_entries: u32,
 }
@@ -94,18 +100,23 @@ impl Plan {
             .max(LEAST_BLOCKS)
             .min(most_blocks)
             .clamp(1, 1 << 16);
-        let node_block_bytes = u64::from(octree.node_words * SIBLINGS) * 4;
-        let most_node_blocks = octree.blocks.min(limits.buffer / node_block_bytes).max(2);
+        let block_texels = u64::from(octree.slots * SIBLINGS);
+        let node_block_bytes = block_texels * (TEXEL_BYTES + RESIDENT_BYTES);
+        let most_node_blocks = octree
+            .blocks
+            .min(limits.buffer / (block_texels * RESIDENT_BYTES))
+            .min(u64::from(limits.rows) * u64::from(NODE_ROW) / block_texels)
+            .max(2);
         let node_blocks = (ceiling / OCTREE_SHARE / node_block_bytes)
             .max(LEAST_NODE_BLOCKS)
             .min(most_node_blocks)
-            .min(1 << 28);
+            .min(1 << 24);
         let plan = |blocks: u64, node_blocks: u64, brick_grid| Self {
             blocks: u32::try_from(blocks).expect("at most 2^16"),
             brick_grid,
             directory,
-            node_blocks: u32::try_from(node_blocks).expect("at most 2^28"),
-            node_words: octree.node_words,
+            node_blocks: u32::try_from(node_blocks).expect("at most 2^24"),
+            slots: octree.slots,
             voxel_bytes,
             block_entries,
         };
@@ -177,9 +188,20 @@ impl Plan {
         self.report_bytes() * (1 + READBACKS)
     }
 
+    /// Texels of the residency octree: one per node and channel.
+    pub(crate) fn node_texels(&self) -> u32 {
+        self.node_blocks * self.slots * SIBLINGS
+    }
+
+    /// Rows of them.
+    pub(crate) fn node_rows(&self) -> u32 {
+        self.node_texels().div_ceil(NODE_ROW)
+    }
+
     /// The residency octree \[bytes\].
     pub(crate) fn octree_bytes(&self) -> u64 {
-        u64::from(self.node_blocks) * u64::from(self.node_words * SIBLINGS) * 4
+        let texels = u64::from(self.node_rows()) * u64::from(NODE_ROW);
+        texels * TEXEL_BYTES + u64::from(self.node_texels()) * RESIDENT_BYTES
     }
 
     fn total_bytes(&self) -> u64 {
@@ -250,12 +272,13 @@ mod tests {
     const NEEDS: Needs = Needs {
         octree: OctreeSize {
             blocks: 1 << 40,
-            node_words: 5,
+            slots: 1,
         },
         voxel_bytes: 1,
     };
     const LIMITS: DeviceLimits = DeviceLimits {
         texture_edge: 2048,
+        rows: 8192,
         buffer: 128 << 20,
     };
 

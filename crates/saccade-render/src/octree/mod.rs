@@ -114,9 +114,9 @@ impl ResidencyOctree {
         &self.geometry
     }
 
-    /// Words of a node.
-    pub(crate) fn node_words(&self) -> u32 {
-        self.nodes.stride()
+    /// Channels that nodes know of at once.
+    pub(crate) fn slots(&self) -> u32 {
+        self.nodes.channels()
     }
 
     /// `(in use, capacity)` \[blocks of eight nodes\].
@@ -325,8 +325,8 @@ impl ResidencyOctree {
         self.events.is_empty() && self.unrecorded.is_empty()
     }
 
-    /// Hands out what changed on since the last call: first word, words.
-    pub(crate) fn flush(&mut self, upload: impl FnMut(u32, &[u32])) {
+    /// Hands out what changed since the last call: first texel, texels, and levels that are resident there.
+    pub(crate) fn flush(&mut self, upload: impl FnMut(u32, &[[u32; 4]], &[u32])) {
         self.nodes.flush(upload);
     }
 

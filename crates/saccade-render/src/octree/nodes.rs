@@ -1,10 +1,10 @@
 //! Where nodes are kept: blocks of eight siblings, as shaders read them.
 
 use super::values::Values;
-use crate::layout::{
-    NODE_BINS, NODE_CHANNEL, NODE_CHANNEL_WORDS, NODE_CHILDREN, NODE_RANGE, NODE_RESIDENT,
-    NODE_VALID, SIBLINGS,
-};
+use crate::layout::{NODE_BINS, NODE_CHILDREN, NODE_RANGE, NODE_VALID, NODE_WORDS, SIBLINGS};
+
+/// What a node says about the values of a channel, as shaders read it.
+type Texel = [u32; NODE_WORDS as usize];
 
 /// What a node knows about a channel from what was noted at the node itself.
 ///
@@ -53,7 +53,10 @@ struct Block {
 pub(crate) struct Nodes {
     channels: u32,
     capacity: u32,
-    words: Vec<u32>,
+    /// Per node and channel.
+    texels: Vec<Texel>,
+    /// Per node and channel, levels with a resident brick, as bits.
+    resident: Vec<u32>,
     own: Vec<Own>,
     blocks: Vec<Block>,
     free: Vec<u32>,
@@ -75,7 +78,8 @@ impl Nodes {
         let mut nodes = Self {
             channels,
             capacity: capacity.max(2),
-            words: Vec::new(),
+            texels: Vec::new(),
+            resident: Vec::new(),
             own: Vec::new(),
             blocks: Vec::new(),
             free: Vec::new(),
@@ -86,11 +90,6 @@ impl Nodes {
         };
         nodes.add(ROOT, |_| Own::NOTHING);
         nodes
-    }
-
-    /// Words of a node.
-    pub(crate) fn stride(&self) -> u32 {
-        NODE_CHANNEL + self.channels * NODE_CHANNEL_WORDS
     }
 
     pub(crate) fn channels(&self) -> u32 {
@@ -107,10 +106,10 @@ impl Nodes {
         self.dirty.len()
     }
 
-    /// Hands out what changed since the last call: first word, words. Forgets it.
-    pub(crate) fn flush(&mut self, mut upload: impl FnMut(u32, &[u32])) {
+    /// Hands out what changed since the last call: first texel, texels, and levels that are resident there. Forgets it.
+    pub(crate) fn flush(&mut self, mut upload: impl FnMut(u32, &[Texel], &[u32])) {
         self.dirty.sort_unstable();
-        let per_block = self.stride() * SIBLINGS;
+        let per_block = self.channels * SIBLINGS;
         let mut dirty = self.dirty.drain(..).peekable();
         while let Some(first) = dirty.next() {
             let mut end = first + 1;
@@ -121,7 +120,11 @@ impl Nodes {
                 block.dirty = false;
             }
             let [from, to] = [first, end].map(|block| (block * per_block) as usize);
-            upload(first * per_block, &self.words[from..to]);
+            upload(
+                first * per_block,
+                &self.texels[from..to],
+                &self.resident[from..to],
+            );
         }
     }
 
@@ -137,7 +140,7 @@ impl Nodes {
 
     /// First child of a node, if it has any.
     pub(crate) fn children(&self, node: u32) -> Option<u32> {
-        let block = self.words[self.word(node) + NODE_CHILDREN as usize];
+        let block = self.texels[self.at(node, 0)][NODE_CHILDREN as usize];
         (block != 0).then_some(block * SIBLINGS)
     }
 
@@ -150,7 +153,7 @@ impl Nodes {
             self.forget_some()?;
         }
         let block = self.add(node, own);
-        self.write(node, NODE_CHILDREN, block);
+        self.set_children(node, block);
         Some(block * SIBLINGS)
     }
 
@@ -169,26 +172,20 @@ impl Nodes {
             block
         } else {
             self.blocks.push(fresh);
-            let nodes = self.blocks.len() * SIBLINGS as usize;
-            self.words.resize(nodes * self.stride() as usize, 0);
-            self.own
-                .resize(nodes * self.channels as usize, Own::NOTHING);
+            let texels = self.blocks.len() * (SIBLINGS * self.channels) as usize;
+            self.texels.resize(texels, [0; NODE_WORDS as usize]);
+            self.resident.resize(texels, 0);
+            self.own.resize(texels, Own::NOTHING);
             u32::try_from(self.blocks.len() - 1).expect("at most the capacity")
         };
         for index in 0..SIBLINGS {
             let node = block * SIBLINGS + index;
-            let first = self.word(node);
-            self.words[first + NODE_CHILDREN as usize] = 0;
             let own = own(index);
             for channel in 0..self.channels {
                 self.set_own(node, channel, own);
-                let first = self.channel_word(node, channel);
-                self.words[first..][..NODE_CHANNEL_WORDS as usize].copy_from_slice(&[
-                    own.values.bins,
-                    own.values.range_word(),
-                    own.valid,
-                    0,
-                ]);
+                let at = self.at(node, channel);
+                self.texels[at] = texel(own.values, own.valid, 0);
+                self.resident[at] = 0;
             }
         }
         self.mark(block);
@@ -231,7 +228,15 @@ impl Nodes {
         self.blocks[block as usize].in_use = false;
         self.free.push(block);
         self.used -= 1;
-        self.write(node, NODE_CHILDREN, 0);
+        self.set_children(node, 0);
+    }
+
+    fn set_children(&mut self, node: u32, block: u32) {
+        for channel in 0..self.channels {
+            let at = self.at(node, channel);
+            self.texels[at][NODE_CHILDREN as usize] = block;
+        }
+        self.mark(node / SIBLINGS);
     }
 
     /// Forgets the detail in some block that no resident brick is noted in: of those that were
@@ -266,35 +271,32 @@ impl Nodes {
     }
 
     pub(crate) fn own(&self, node: u32, channel: u32) -> Own {
-        self.own[(node * self.channels + channel) as usize]
+        self.own[self.at(node, channel)]
     }
 
     /// Changes what was noted at a node; what it says follows from [`Self::set_known`].
     pub(crate) fn set_own(&mut self, node: u32, channel: u32, own: Own) {
-        self.own[(node * self.channels + channel) as usize] = own;
+        let at = self.at(node, channel);
+        self.own[at] = own;
     }
 
     pub(crate) fn known(&self, node: u32, channel: u32) -> Known {
-        let word = |word: u32| self.words[self.channel_word(node, channel) + word as usize];
+        let at = self.at(node, channel);
+        let word = |word: u32| self.texels[at][word as usize];
         Known {
             values: Values::from_words(word(NODE_BINS), word(NODE_RANGE)),
             valid: word(NODE_VALID),
-            resident: word(NODE_RESIDENT),
+            resident: self.resident[at],
         }
     }
 
     pub(crate) fn set_known(&mut self, node: u32, channel: u32, known: Known) {
-        let first = NODE_CHANNEL + channel * NODE_CHANNEL_WORDS;
-        self.write(node, first + NODE_BINS, known.values.bins);
-        self.write(node, first + NODE_RANGE, known.values.range_word());
-        self.write(node, first + NODE_VALID, known.valid);
-        self.write(node, first + NODE_RESIDENT, known.resident);
-    }
-
-    fn write(&mut self, node: u32, word: u32, value: u32) {
-        let at = self.word(node) + word as usize;
-        if self.words[at] != value {
-            self.words[at] = value;
+        let at = self.at(node, channel);
+        let children = self.texels[at][NODE_CHILDREN as usize];
+        let texel = texel(known.values, known.valid, children);
+        if (self.texels[at], self.resident[at]) != (texel, known.resident) {
+            self.texels[at] = texel;
+            self.resident[at] = known.resident;
             self.mark(node / SIBLINGS);
         }
     }
@@ -306,17 +308,22 @@ impl Nodes {
         }
     }
 
-    fn word(&self, node: u32) -> usize {
-        node as usize * self.stride() as usize
+    fn at(&self, node: u32, channel: u32) -> usize {
+        (node * self.channels + channel) as usize
     }
 
-    fn channel_word(&self, node: u32, channel: u32) -> usize {
-        self.word(node) + (NODE_CHANNEL + channel * NODE_CHANNEL_WORDS) as usize
-    }
-
-    /// All words, as the device is to have them.
+    /// All of it, as the device is to have it.
     #[cfg(test)]
-    pub(crate) fn words(&self) -> &[u32] {
-        &self.words
+    pub(crate) fn as_uploaded(&self) -> (&[Texel], &[u32]) {
+        (&self.texels, &self.resident)
     }
+}
+
+fn texel(values: Values, valid: u32, children: u32) -> Texel {
+    let mut texel = [0; NODE_WORDS as usize];
+    texel[NODE_BINS as usize] = values.bins;
+    texel[NODE_RANGE as usize] = values.range_word();
+    texel[NODE_VALID as usize] = valid;
+    texel[NODE_CHILDREN as usize] = children;
+    texel
 }

@@ -134,7 +134,7 @@ struct World {
     resident: BTreeSet<BrickId>,
     known: BTreeSet<BrickId>,
     /// The nodes as the device has them.
-    device: Vec<u32>,
+    device: Vec<([u32; 4], u32)>,
     random: u32,
 }
 
@@ -165,7 +165,7 @@ impl World {
             ids,
             resident: BTreeSet::new(),
             known: BTreeSet::new(),
-            device: vec![0xdead_beef; 0],
+            device: Vec::new(),
             random: 1,
         }
     }
@@ -266,13 +266,21 @@ impl World {
 
     fn flush(&mut self) {
         let device = &mut self.device;
-        self.tree.flush(|first, words| {
-            let end = first as usize + words.len();
-            device.resize(device.len().max(end), 0xdead_beef);
-            device[first as usize..end].copy_from_slice(words);
+        self.tree.flush(|first, texels, resident| {
+            let end = first as usize + texels.len();
+            assert_eq!(texels.len(), resident.len());
+            device.resize(device.len().max(end), ([0xdead_beef; 4], 0xdead_beef));
+            let new = texels.iter().copied().zip(resident.iter().copied());
+            for (device, new) in device[first as usize..end].iter_mut().zip(new) {
+                *device = new;
+            }
         });
-        let words = self.tree.nodes.words();
-        assert!(device[..] == *words, "the device has another tree");
+        let (texels, resident) = self.tree.nodes.as_uploaded();
+        let wanted = texels.iter().copied().zip(resident.iter().copied());
+        assert!(
+            device.iter().copied().eq(wanted),
+            "the device has another tree"
+        );
     }
 
     /// All nodes, with depth and position; each block is met once.

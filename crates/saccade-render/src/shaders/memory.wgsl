@@ -91,7 +91,8 @@ fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
     return Found(value & ~STALE, (value & STALE) != 0u, physical, span_log2);
 }
 
-fn find(channel: u32, level: u32, brick: vec3u) -> Found {
+// `base` is the level's first entry of the channel in the page directory, which has `size` of them per axis.
+fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found {
     let edge = frame.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
     let block_at = brick >> vec3u(edge);
@@ -101,9 +102,7 @@ fn find(channel: u32, level: u32, brick: vec3u) -> Found {
     var physical = 0u;
     if !is_last {
         span = edge * (frame.depth - 1u);
-        let size = frame.levels[level].directory;
         let cell = brick >> vec3u(span);
-        let base = frame.channels[channel].directory_offset + frame.levels[level].directory_base;
         physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
         value = directory[physical];
         lookups += 1u;

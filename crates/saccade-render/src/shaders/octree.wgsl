@@ -1,11 +1,14 @@
 // The residency octree: what a region holds, and which levels are there.
 //
-// Nodes are words: the block of their eight children, then what is known per channel. What a node
+// A node has a texel per channel: what is known of its values, and the block of its eight children. What it
 // says about values holds for some levels only, and it says for which.
 
 // Per channel a row: linear RGB and extinction [1/nm] by stored value.
 @group(0) @binding(6) var colors: texture_2d<f32>;
-@group(0) @binding(10) var<storage, read> nodes: array<u32>;
+// A texture, since drivers that draw on the CPU read a buffer value by value.
+@group(0) @binding(10) var nodes: texture_2d<u32>;
+// Per node and channel, levels with a resident brick that overlaps the node, as bits.
+@group(0) @binding(11) var<storage, read> residents: array<u32>;
 
 // What is known of the space around a sample, a bit per channel.
 struct Region {
@@ -14,11 +17,17 @@ struct Region {
     leaving: f32,  // depth up to which this holds
 }
 
-// Nodes from the root to the one visited last: the next sample is in one of them, or near.
-var<private> path: array<u32, MOST_DEPTHS>;
-// Channels that are hidden in each of them, and those of which a closer look tells nothing new.
-var<private> path_hidden: array<u32, MOST_DEPTHS>;
-var<private> path_settled: array<u32, MOST_DEPTHS>;
+// The node visited last and seven above it: the next sample is in one of them, or near. In registers, which an
+// array that is addressed by number is not; who climbs higher begins at the root [001 section 9.2.2].
+struct Path {
+    near: vec4u, // the node, then those above it
+    far: vec4u,
+}
+
+var<private> path: Path;
+// Channels that are hidden in each of them, and in the upper half those of which a closer look tells nothing new.
+var<private> path_known: Path;
+var<private> path_held: u32;
 var<private> path_depth: u32;
 var<private> path_level: u32 = 0xffffffffu;
 var<private> path_cell: vec3u;
@@ -95,18 +104,28 @@ fn is_range_hidden(channel: u32, low: u32, high: u32) -> bool {
     return high == 0u || last < here.first_opaque || first > here.last_opaque;
 }
 
+fn pushed(path: Path, value: u32) -> Path {
+    return Path(vec4u(value, path.near.xyz), vec4u(path.near.w, path.far.xyz));
+}
+
+fn popped(path: Path) -> Path {
+    return Path(vec4u(path.near.yzw, path.far.x), vec4u(path.far.yzw, 0u));
+}
+
+// What a node knows of a channel: NODE_BINS, NODE_RANGE, NODE_VALID and NODE_CHILDREN.
+fn node_texel(node: u32, channel: u32) -> vec4u {
+    let texel = node * frame.octree.slots + frame.channels[channel].octree_slot;
+    return textureLoad(nodes, vec2u(texel % NODE_ROW, texel / NODE_ROW), 0);
+}
+
 // The largest node around a sample in which each channel is hidden, all alike or nearly all seen, else the
 // deepest there. One walk for all channels [001 alg. 7.1].
 //
 // Starts from the nodes that the sample before was in [001 section 9.4]: those it shares with it
 // were not enough.
-fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
+fn region_at(level: u32, deepest: u32, depth: f32, ray: vec3f) -> Region {
     let cell = cell_at(depth, ray);
     let everything = all_channels();
-    var deepest = 0u;
-    for (var c = 0u; c < channel_count(); c += 1u) {
-        deepest = max(deepest, frame.levels[channel_level(c, level)].values_depth);
-    }
     var at = 0u;
     var is_new = true;
     if level == path_level {
@@ -114,27 +133,37 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
         let moved = cell ^ path_cell;
         while at > 0u && any((moved >> axes(frame.octree.depths[at].shift)) != vec3u(0u)) {
             at -= 1u;
+            path = popped(path);
+            if SLOTS > 1u {
+                path_known = popped(path_known);
+            }
         }
-        is_new = at == path_depth;
+        let climbed = path_depth - at;
+        path_held -= min(climbed, path_held);
+        at = select(at, 0u, path_held == 0u);
+        is_new = climbed == 0u || path_held == 0u;
+    } else {
+        path_held = 0u;
     }
     path_cell = cell;
     path_level = level;
-    var node = path[at];
+    if path_held == 0u {
+        // The root is node 0.
+        path = Path();
+        path_known = Path();
+        path_held = 1u;
+    }
+    var node = path.near.x;
     var hidden = 0u;
     var settled = 0u;
     var alike = 0u;
     // With one channel, a node in which it is hidden or settled ends the walk: those above know nothing.
     if SLOTS > 1u {
-        if !is_new {
-            hidden = path_hidden[at];
-            settled = path_settled[at];
-        } else if at > 0u {
-            hidden = path_hidden[at - 1u];
-            settled = path_settled[at - 1u];
-        }
+        hidden = path_known.near.x & 0xffffu;
+        settled = path_known.near.x >> 16u;
     }
     loop {
-        let first = node * frame.octree.node_words;
+        var children = 0u;
         if is_new {
             nodes_visited += 1u;
             alike = 0u;
@@ -143,18 +172,19 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
                 let c = lowest_of(rest);
                 rest &= rest - 1u;
                 let bit = 1u << c;
+                let known = node_texel(node, c);
+                children = known[NODE_CHILDREN];
                 if !channel_has(c, CHANNEL_VALUES) {
                     settled |= bit;
                     continue;
                 }
-                let known = first + NODE_CHANNEL + frame.channels[c].octree_slot * NODE_CHANNEL_WORDS;
-                if ((nodes[known + NODE_VALID] >> channel_level(c, level)) & 1u) == 0u {
+                if ((known[NODE_VALID] >> channel_level(c, level)) & 1u) == 0u {
                     continue;
                 }
-                let range = nodes[known + NODE_RANGE];
+                let range = known[NODE_RANGE];
                 let low = range & 0xffffu;
                 let high = range >> 16u;
-                let bins = nodes[known + NODE_BINS];
+                let bins = known[NODE_BINS];
                 let visible = countOneBits(bins & frame.channels[c].visible_bins);
                 if visible == 0u || is_range_hidden(c, low, high) {
                     hidden |= bit;
@@ -168,24 +198,37 @@ fn region_at(level: u32, depth: f32, ray: vec3f) -> Region {
                 }
             }
             if SLOTS > 1u {
-                path_hidden[at] = hidden;
-                path_settled[at] = settled;
+                path_known.near.x = hidden | (settled << 16u);
             }
             if (hidden | settled) == everything {
                 break;
             }
+        } else {
+            children = node_texel(node, 0u)[NODE_CHILDREN];
         }
-        let children = nodes[first + NODE_CHILDREN];
         if at >= deepest || children == 0u {
             break;
         }
         at += 1u;
         node = children * SIBLINGS + child_index(cell, at);
-        path[at] = node;
+        path = pushed(path, node);
+        path_held = min(path_held + 1u, PATH_HOLDS);
+        if SLOTS > 1u {
+            path_known = pushed(path_known, path_known.near.x);
+        }
         is_new = true;
     }
     path_depth = at;
     return Region(hidden, alike, leaving_node(cell, at, ray));
+}
+
+// The deepest nodes that know values of the levels drawn where `level` is wanted.
+fn deepest_of(level: u32) -> u32 {
+    var deepest = 0u;
+    for (var c = 0u; c < channel_count(); c += 1u) {
+        deepest = max(deepest, frame.levels[channel_level(c, level)].values_depth);
+    }
+    return deepest;
 }
 
 // Levels that may be found around a place, as bits: a brick overlaps the smallest node there, or
@@ -196,11 +239,10 @@ fn levels_around(channel: u32, cell: vec3u) -> u32 {
     var levels = 0u;
     loop {
         nodes_visited += 1u;
-        let first = node * frame.octree.node_words;
-        let known = first + NODE_CHANNEL + frame.channels[channel].octree_slot * NODE_CHANNEL_WORDS;
-        let resident = nodes[known + NODE_RESIDENT];
-        levels |= nodes[known + NODE_VALID];
-        let children = nodes[first + NODE_CHILDREN];
+        let known = node_texel(node, channel);
+        let resident = residents[node * frame.octree.slots + frame.channels[channel].octree_slot];
+        levels |= known[NODE_VALID];
+        let children = known[NODE_CHILDREN];
         if children == 0u || at + 1u >= MOST_DEPTHS {
             levels |= resident;
             break;

@@ -29,29 +29,55 @@ var<private> substituted: u32;
 var<private> substituted_levels: u32;
 var<private> finest: u32 = MAX_LEVELS;
 
+// A level as a ray meets it, positions in its voxels from the anchor's low corner. Read once where the level changes: what is
+// addressed by number is slow to read.
+struct Grid {
+    level: u32,
+    eye: vec3f,
+    voxels: vec3f,  // along the ray, per depth
+    inverse: vec3f, // depth per voxel along each axis
+    anchor: vec3i,  // [bricks]
+    last: vec3i,    // [bricks]
+    directory: vec3u,
+    directory_base: u32,
+}
+
+fn grid_of(level: u32, ray: vec3f) -> Grid {
+    let here = frame.levels[level];
+    let voxels = ray * here.voxels_per_nm;
+    return Grid(
+        level,
+        here.eye,
+        voxels,
+        1.0 / divisible(voxels),
+        here.anchor,
+        vec3i(here.bricks) - 1,
+        here.directory,
+        here.directory_base,
+    );
+}
+
 // A brick position: which, and where its low corner is.
 struct Place {
     brick: vec3u,
     low: vec3f, // [voxels of the level from the anchor's low corner]
 }
 
-fn place_of(level: u32, depth: f32, ray: vec3f) -> Place {
-    let at = frame.levels[level].eye + depth * ray * frame.levels[level].voxels_per_nm;
-    let anchor = frame.levels[level].anchor;
-    let last = vec3i(frame.levels[level].bricks) - 1;
+fn place_of(grid: Grid, depth: f32) -> Place {
+    let at = grid.eye + depth * grid.voxels;
     // Far beyond any volume, yet safe to convert.
     let steps = clamp(floor(at / f32(BRICK_EDGE)), vec3f(-1e9), vec3f(1e9));
-    let brick = clamp(anchor + vec3i(steps), vec3i(0), last);
-    return Place(vec3u(brick), vec3f(brick - anchor) * f32(BRICK_EDGE));
+    let brick = clamp(grid.anchor + vec3i(steps), vec3i(0), grid.last);
+    return Place(vec3u(brick), vec3f(brick - grid.anchor) * f32(BRICK_EDGE));
 }
 
 // Depth at which a ray leaves the cube of `1 << span_log2` bricks that a brick is in.
-fn leaving(level: u32, place: Place, span_log2: u32, ray: vec3f) -> f32 {
+fn leaving(grid: Grid, place: Place, span_log2: u32) -> f32 {
     let first = (place.brick >> vec3u(span_log2)) << vec3u(span_log2);
     let low = place.low - vec3f(place.brick - first) * f32(BRICK_EDGE);
     let high = low + f32(BRICK_EDGE << span_log2);
-    let voxels = ray * frame.levels[level].voxels_per_nm;
-    return leaving_depth(low, high, frame.levels[level].eye, voxels);
+    let depths = (select(low, high, grid.voxels >= vec3f(0.0)) - grid.eye) * grid.inverse;
+    return min(depths.x, min(depths.y, depths.z));
 }
 
 fn is_transparent(channel: u32, slot: u32) -> bool {
@@ -69,18 +95,27 @@ fn color_of(channel: u32, stored: f32) -> vec4f {
     return select(vec4f(0.0), color, stored > 0.0);
 }
 
+// In false colours, how far the level that is drawn lies from the one that is wanted.
+fn tinted(channel: u32, color: vec4f) -> vec4f {
+    let distance = i32(drawn[channel].level) - i32(drawn_for[channel]);
+    let tint = mix(color.rgb, substitution_tint(distance), 0.5);
+    return vec4f(select(tint, color.rgb, distance == 0), color.a);
+}
+
 // What is drawn for a stretch of the ray.
 struct Source {
     level: u32,
     found: Found,
-    place: Place,
-    leaving: f32, // depth up to which it holds
+    eye: vec3f,     // [voxels of the level from the brick's low corner]
+    voxels: vec3f,  // along the ray, per depth
+    leaving: f32,   // depth up to which it holds
 }
 
-fn source(channel: u32, level: u32, depth: f32, ray: vec3f) -> Source {
-    let place = place_of(level, depth, ray);
-    let found = find(channel, level, place.brick);
-    return Source(level, found, place, leaving(level, place, found.span_log2, ray));
+fn source(channel: u32, grid: Grid, depth: f32) -> Source {
+    let place = place_of(grid, depth);
+    let entry = frame.channels[channel].directory_offset + grid.directory_base;
+    let found = find(channel, grid.level, place.brick, entry, grid.directory);
+    return Source(grid.level, found, grid.eye - place.low, grid.voxels, leaving(grid, place, found.span_log2));
 }
 
 // Bits below one.
@@ -128,6 +163,8 @@ var<private> sample_before: array<f32, SLOTS>;
 var<private> surface: u32;
 var<private> surface_level: u32;
 var<private> surface_at: vec3f;
+// How far ahead of the first sample it is; nothing there is farther.
+var<private> hit_at: f32;
 // Light that comes through to it; 0 where there is none.
 var<private> surface_light: f32;
 
@@ -146,9 +183,9 @@ fn draw_from(channel: u32, here: Source) {
 }
 
 // Looks up what is drawn of a channel from `depth` on; whether that is all there is to it.
-fn look_up(channel: u32, wanted: u32, depth: f32, ray: vec3f) -> bool {
-    let here = source(channel, wanted, depth, ray);
-    drawn_for[channel] = wanted;
+fn look_up(channel: u32, grid: Grid, depth: f32) -> bool {
+    let here = source(channel, grid, depth);
+    drawn_for[channel] = grid.level;
     draw_from(channel, here);
     return here.found.entry >= FIRST_SLOT && !here.found.stale;
 }
@@ -191,7 +228,7 @@ fn look_further(channel: u32, depth: f32, ray: vec3f, urgency: f32) {
         } else {
             finer &= bits_below(level);
         }
-        let other = source(channel, level, depth, ray);
+        let other = source(channel, grid_of(level, ray), depth);
         if widens {
             if other.found.entry != EMPTY || other.found.stale {
                 break;
@@ -222,26 +259,24 @@ fn corner_of(channel: u32) -> vec3f {
 }
 
 // Where samples from `depth` on lie in the brick cache.
-fn aim(channel: u32, depth: f32, ray: vec3f) {
+fn aim(channel: u32, depth: f32) {
     let here = drawn[channel];
     let corner = corner_of(channel);
-    let voxels = ray * frame.levels[here.level].voxels_per_nm;
     low_texel[channel] = corner * texel;
-    first_texel[channel] = (corner + frame.levels[here.level].eye - here.place.low + depth * voxels) * texel;
-    texels_per_depth[channel] = voxels * texel;
+    first_texel[channel] = (corner + here.eye + depth * here.voxels) * texel;
+    texels_per_depth[channel] = here.voxels * texel;
 }
 
 // Where samples lie in one brick of a row, the first of the row at `depth`, and with which sample it begins.
-fn aim_in_row(index: u32, turn: f32, depth: f32, ray: vec3f) {
+fn aim_in_row(index: u32, turn: f32, depth: f32) {
     let here = drawn[0];
     let corner = corner_of(0u);
-    let voxels = ray * frame.levels[here.level].voxels_per_nm;
     let low = corner * texel;
-    let first = (corner + frame.levels[here.level].eye - here.place.low + depth * voxels) * texel;
+    let first = (corner + here.eye + depth * here.voxels) * texel;
     if index == 0u {
         low_texel[0] = low;
         first_texel[0] = first;
-        texels_per_depth[0] = voxels * texel;
+        texels_per_depth[0] = here.voxels * texel;
         turns = vec2f(3e38);
     } else if index == 1u {
         next_low[0] = low;
@@ -295,7 +330,41 @@ fn joined(texel: vec3i) -> f32 {
 // A place in a channel's brick, so far ahead of the first sample.
 fn in_brick(channel: u32, ahead: f32) -> vec3f {
     let at = first_texel[channel] + ahead * texels_per_depth[channel];
-    return clamp(at, low_texel[channel], low_texel[channel] + f32(BRICK_EDGE) * texel);
+    if BOUNDED {
+        return clamp(at, low_texel[channel], low_texel[channel] + f32(BRICK_EDGE) * texel);
+    }
+    return at;
+}
+
+// Takes a sample of a channel, so far ahead of the first. Linear RGB and extinction of it, or what the mode keeps of it.
+fn sampled_at(channel: u32, ahead: f32, step: f32) -> vec4f {
+    let stored = stored_at(in_brick(channel, ahead));
+    if MODE == MODE_EMISSION_ABSORPTION {
+        let color = color_of(channel, stored);
+        if TINTED {
+            return tinted(channel, color);
+        }
+        return color;
+    }
+    if MODE == MODE_MAXIMUM {
+        largest_seen[channel] = max(largest_seen[channel], stored);
+    } else {
+        let iso = frame.channels[channel].iso;
+        let before = sample_before[channel];
+        sample_before[channel] = stored;
+        if stored >= iso {
+            let rise = stored - before;
+            let back = select(0.0, (stored - iso) / rise, rise > 0.0 && before < iso);
+            let at = ahead - back * step;
+            if at < hit_at {
+                hit_at = at;
+                surface = channel;
+                surface_level = drawn[channel].level;
+                surface_at = in_brick(channel, at);
+            }
+        }
+    }
+    return vec4f(0.0);
 }
 
 // Light from the surface that ended the ray: as bright as it faces the eye.
@@ -337,7 +406,6 @@ fn trace(pixel: vec2u) -> vec3f {
     }
     let urgency = 1.0 + dot(from_middle, from_middle);
     let sample_at = select(0.5, pixel_noise(pixel), has_flag(FLAG_JITTER));
-    let false_colors = has_flag(FLAG_FALSE_COLORS);
     let everything = all_channels();
     texel = select(1.0 / vec3f(frame.brick_grid * BRICK_STORED_EDGE), vec3f(1.0), JOINED);
 
@@ -381,246 +449,234 @@ fn trace(pixel: vec2u) -> vec3f {
                 finest_drawn = min(finest_drawn, channel_level(c, level));
             }
             finest = min(finest, finest_drawn);
-            let voxels_per_depth = length(ray * frame.levels[finest_drawn].voxels_per_nm);
+            let deepest = deepest_of(level);
+            var grid = grid_of(finest_drawn, ray);
+            let voxels_per_depth = length(grid.voxels);
             let doublings = min(segments / SEGMENTS_PER_DOUBLING, 64u);
             let step = 0.5 / voxels_per_depth * exp2(f32(doublings));
             // Level and step hold up to here.
             let stretch = min(level_end, depths.y);
             let doubling = (segments / SEGMENTS_PER_DOUBLING + 1u) * SEGMENTS_PER_DOUBLING;
 
-            // Past regions with nothing to see.
-            var region = Region(0u, 0u, 3e38);
-            var is_seen = true;
+            // Region by region.
             loop {
-                depth = start + sample_at * min(step, depths.y - start);
-                if has_flag(FLAG_OCTREE) {
-                    region = region_at(level, depth, ray);
-                }
-                is_seen = region.hidden != everything;
-                if is_seen {
-                    break;
-                }
-                let count = segments_until(min(stretch + sample_at * step, region.leaving), depth, step);
-                start += f32(count) * step;
-                segments += count;
-                found = 0u;
-                nothing_before(everything);
-                if start >= stretch || segments >= doubling {
-                    break;
-                }
-            }
-            if !is_seen {
-                continue;
-            }
-            let hidden = region.hidden;
-            let around = region.leaving;
-            let visible = everything & ~hidden;
-
-            if MODE == MODE_EMISSION_ABSORPTION && (hidden | region.uniform_) == everything {
-                let count = segments_until(min(stretch + sample_at * step, around), depth, step);
-                var sum = vec4f(0.0);
-                for (var c = 0u; c < channel_count(); c += 1u) {
-                    if (hidden & (1u << c)) == 0u {
-                        let color = color_of(c, uniform_stored[c]);
-                        sum += vec4f(color.a * color.rgb, color.a);
+                // Past regions with nothing to see.
+                var region = Region(0u, 0u, 3e38);
+                var is_seen = true;
+                loop {
+                    depth = start + sample_at * min(step, depths.y - start);
+                    if has_flag(FLAG_OCTREE) {
+                        region = region_at(level, deepest, depth, ray);
+                    }
+                    is_seen = region.hidden != everything;
+                    if is_seen {
+                        break;
+                    }
+                    let count = segments_until(min(stretch + sample_at * step, region.leaving), depth, step);
+                    start += f32(count) * step;
+                    segments += count;
+                    found = 0u;
+                    nothing_before(everything);
+                    if start >= stretch || segments >= doubling {
+                        break;
                     }
                 }
-                if sum.a > 0.0 {
-                    let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
-                    let opacity = opacity_of_length(sum.a, thickness * nm_per_depth);
-                    light += transmitted * opacity * sum.rgb / sum.a;
-                    transmitted *= 1.0 - opacity;
+                if !is_seen {
+                    continue;
                 }
-                start += f32(count) * step;
-                segments += count;
-                continue;
-            }
+                let hidden = region.hidden;
+                let around = region.leaving;
+                let visible = everything & ~hidden;
 
-            // From brick to brick within the region.
-            loop {
-                let first = min(step, depths.y - start);
-                depth = start + sample_at * first;
-                lost = 0u;
-                var count = 0u;
-                var sampled = 0u;
-                var forgets = false;
-                if SLOTS == 1u {
-                    // Several bricks in a row: rays that are drawn at once wait for each other at its end, and no
-                    // longer at the end of each brick. Surfaces end rays too soon for that, and what is behind
-                    // the end of a ray need not be looked up: a ray that would end if each of the next three bricks took
-                    // as much light as the last row did goes on brick by brick, as its first does.
-                    let taken = transmitted / row_light;
-                    let goes_on = transmitted * taken * taken * taken > TERMINATION;
-                    row_light = transmitted;
-                    let most_bricks = select(1u, 3u, goes_on && MODE != MODE_ISO_SURFACE);
-                    let wanted = channel_level(0u, level);
-                    let most = stretch + sample_at * step;
-                    for (var index = 0u; index < most_bricks; index += 1u) {
-                        let from_ = start + f32(count) * step;
-                        let next = from_ + sample_at * min(step, depths.y - from_);
-                        let holds = wanted == drawn_for[0] && next < drawn[0].leaving;
-                        let before = vec2u(missing, transparent);
-                        if !holds && found == 0u && !look_up(0u, wanted, next, ray) {
-                            if index == 0u {
-                                lost = 1u;
-                            } else {
-                                // The next row begins with it.
-                                forgets = true;
-                                missing = before.x;
-                                transparent = before.y;
-                            }
-                            break;
+                if MODE == MODE_EMISSION_ABSORPTION && (hidden | region.uniform_) == everything {
+                    let count = segments_until(min(stretch + sample_at * step, around), depth, step);
+                    var sum = vec4f(0.0);
+                    for (var c = 0u; c < channel_count(); c += 1u) {
+                        if (hidden & (1u << c)) == 0u {
+                            let color = color_of(c, uniform_stored[c]);
+                            sum += vec4f(color.a * color.rgb, color.a);
                         }
-                        found = 0u;
-                        if transparent != 0u {
+                    }
+                    if sum.a > 0.0 {
+                        let thickness = max(min(f32(count) * step, depths.y - start), 0.0);
+                        let opacity = opacity_of_length(sum.a, thickness * nm_per_depth);
+                        light += transmitted * opacity * sum.rgb / sum.a;
+                        transmitted *= 1.0 - opacity;
+                    }
+                    start += f32(count) * step;
+                    segments += count;
+                    continue;
+                }
+
+                // From brick to brick within the region.
+                loop {
+                    let first = min(step, depths.y - start);
+                    depth = start + sample_at * first;
+                    lost = 0u;
+                    var count = 0u;
+                    var sampled = 0u;
+                    var forgets = false;
+                    if SLOTS == 1u {
+                        // Several bricks in a row: rays that are drawn at once wait for each other at its end, and no
+                        // longer at the end of each brick. Surfaces end rays too soon for that, and what is behind
+                        // the end of a ray need not be looked up: a ray that would end if each of the next three bricks took
+                        // as much light as the last row did goes on brick by brick, as its first does.
+                        let taken = transmitted / row_light;
+                        let goes_on = transmitted * taken * taken * taken > TERMINATION;
+                        row_light = transmitted;
+                        let most_bricks = select(1u, 3u, goes_on && MODE != MODE_ISO_SURFACE);
+                        let wanted = grid.level;
+                        let most = stretch + sample_at * step;
+                        for (var index = 0u; index < most_bricks; index += 1u) {
+                            let from_ = start + f32(count) * step;
+                            let next = from_ + sample_at * min(step, depths.y - from_);
+                            let holds = wanted == drawn_for[0] && next < drawn[0].leaving;
+                            let before = vec2u(missing, transparent);
+                            if !holds && found == 0u && !look_up(0u, grid, next) {
+                                if index == 0u {
+                                    lost = 1u;
+                                } else {
+                                    // The next row begins with it.
+                                    forgets = true;
+                                    missing = before.x;
+                                    transparent = before.y;
+                                }
+                                break;
+                            }
+                            found = 0u;
+                            if transparent != 0u {
+                                // Where nothing of a brick is seen, it is passed as a whole.
+                                if index == 0u {
+                                    count = segments_until(min(most, drawn[0].leaving), next, step);
+                                }
+                                break;
+                            }
+                            aim_in_row(index, f32(count), depth);
+                            sampled = 1u;
+                            count += segments_until(min(min(most, around), drawn[0].leaving), next, step);
+                            let end = start + f32(count) * step;
+                            let last = end + sample_at * min(step, depths.y - end);
+                            if index + 1u >= most_bricks || drawn[0].level != wanted || end >= stretch || last >= around || segments + count >= doubling {
+                                break;
+                            }
+                        }
+                    } else {
+                        var until = stretch + sample_at * step;
+                        if hidden != 0u {
+                            until = min(until, around);
+                        }
+                        var rest = visible;
+                        for (var n = count_of(visible); n > 0u; n -= 1u) {
+                            let c = lowest_of(rest);
+                            rest &= rest - 1u;
+                            let bit = 1u << c;
+                            let wanted = channel_level(c, level);
+                            let holds = wanted == drawn_for[c] && depth < drawn[c].leaving;
+                            if !holds && (found & bit) == 0u {
+                                if wanted != grid.level {
+                                    grid = grid_of(wanted, ray);
+                                }
+                                if !look_up(c, grid, depth) {
+                                    lost |= bit;
+                                }
+                            }
                             // Where nothing of a brick is seen, it is passed as a whole.
-                            if index == 0u {
-                                count = segments_until(min(most, drawn[0].leaving), next, step);
+                            until = min(until, drawn[c].leaving);
+                            if (transparent & bit) == 0u {
+                                until = min(until, around);
                             }
-                            break;
                         }
-                        aim_in_row(index, f32(count), depth, ray);
-                        sampled = 1u;
-                        count += segments_until(min(min(most, around), drawn[0].leaving), next, step);
-                        let end = start + f32(count) * step;
-                        let last = end + sample_at * min(step, depths.y - end);
-                        if index + 1u >= most_bricks || drawn[0].level != wanted || end >= stretch || last >= around || segments + count >= doubling {
-                            break;
-                        }
+                        found = select(0u, found, lost != 0u);
+                        count = segments_until(until, depth, step);
+                        sampled = visible & ~transparent;
                     }
-                } else {
-                    var until = stretch + sample_at * step;
-                    if hidden != 0u {
-                        until = min(until, around);
+                    if lost != 0u {
+                        break;
                     }
+                    nothing_before(everything & ~sampled);
                     var rest = visible;
                     for (var n = count_of(visible); n > 0u; n -= 1u) {
                         let c = lowest_of(rest);
                         rest &= rest - 1u;
-                        let bit = 1u << c;
-                        let wanted = channel_level(c, level);
-                        let holds = wanted == drawn_for[c] && depth < drawn[c].leaving;
-                        if !holds && (found & bit) == 0u {
-                            if !look_up(c, wanted, depth, ray) {
-                                lost |= bit;
+                        if drawn[c].found.entry >= FIRST_SLOT {
+                            let distance = i32(drawn[c].level) - i32(drawn_for[c]);
+                            if distance != 0 {
+                                substituted_levels = max(substituted_levels, u32(abs(distance)));
+                                substituted += count;
                             }
                         }
-                        // Where nothing of a brick is seen, it is passed as a whole.
-                        until = min(until, drawn[c].leaving);
-                        if (transparent & bit) == 0u {
-                            until = min(until, around);
+                        if SLOTS > 1u && (sampled & (1u << c)) != 0u {
+                            aim(c, depth);
                         }
                     }
-                    found = select(0u, found, lost != 0u);
-                    count = segments_until(until, depth, step);
-                    sampled = visible & ~transparent;
-                }
-                if lost != 0u {
-                    break;
-                }
-                nothing_before(everything & ~sampled);
-                var rest = visible;
-                for (var n = count_of(visible); n > 0u; n -= 1u) {
-                    let c = lowest_of(rest);
-                    rest &= rest - 1u;
-                    if drawn[c].found.entry >= FIRST_SLOT {
-                        let distance = i32(drawn[c].level) - i32(drawn_for[c]);
-                        if distance != 0 {
-                            substituted_levels = max(substituted_levels, u32(abs(distance)));
-                            substituted += count;
-                        }
-                    }
-                    if SLOTS > 1u && (sampled & (1u << c)) != 0u {
-                        aim(c, depth, ray);
-                    }
-                }
-                var left = select(0u, count, sampled != 0u);
-                samples += left * countOneBits(sampled);
-                var i = 0.0;
-                if left > 0u {
-                    loop {
-                        let segment = min(step, depths.y - start - i * step);
-                        let ahead = i * step + sample_at * (segment - first);
-                        var sum = vec4f(0.0);
-                        var hit_at = 3e38;
-                        var rest = sampled;
-                        for (var n = count_of(sampled); n > 0u; n -= 1u) {
-                            let c = lowest_of(rest);
-                            rest &= rest - 1u;
-                            let stored = stored_at(in_brick(c, ahead));
-                            if MODE == MODE_MAXIMUM {
-                                largest_seen[c] = max(largest_seen[c], stored);
-                            } else if MODE == MODE_ISO_SURFACE {
-                                let iso = frame.channels[c].iso;
-                                if stored >= iso {
-                                    let rise = stored - sample_before[c];
-                                    let back = select(0.0, (stored - iso) / rise, rise > 0.0 && sample_before[c] < iso);
-                                    let at = ahead - back * step;
-                                    if at < hit_at {
-                                        hit_at = at;
-                                        surface = c;
-                                        surface_level = drawn[c].level;
-                                        surface_at = in_brick(c, at);
-                                    }
-                                }
-                                sample_before[c] = stored;
+                    var left = select(0u, count, sampled != 0u);
+                    samples += left * countOneBits(sampled);
+                    var i = 0.0;
+                    if left > 0u {
+                        loop {
+                            let segment = min(step, depths.y - start - i * step);
+                            let ahead = i * step + sample_at * (segment - first);
+                            var sum = vec4f(0.0);
+                            hit_at = 3e38;
+                            if SLOTS == 1u {
+                                sum = sampled_at(0u, ahead, step);
                             } else {
-                                var color = color_of(c, stored);
-                                let distance = i32(drawn[c].level) - i32(drawn_for[c]);
-                                if false_colors && distance != 0 {
-                                    color = vec4f(mix(color.rgb, substitution_tint(distance), 0.5), color.a);
+                                var rest = sampled;
+                                for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
+                                    let color = sampled_at(firstTrailingBit(rest), ahead, step);
+                                    rest &= rest - 1u;
+                                    sum += vec4f(color.a * color.rgb, color.a);
                                 }
-                                sum += vec4f(select(color.a * color.rgb, color.rgb, SLOTS == 1u), color.a);
+                            }
+                            if MODE == MODE_EMISSION_ABSORPTION {
+                                let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
+                                let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
+                                light += transmitted * opacity * share * sum.rgb;
+                                transmitted *= 1.0 - opacity;
+                            }
+                            if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
+                                surface_light = transmitted;
+                                transmitted = 0.0;
+                            }
+                            i += 1.0;
+                            left -= 1u;
+                            if SLOTS == 1u && i >= turns.x {
+                                first_texel[0] = next_texel[0];
+                                if BOUNDED { low_texel[0] = next_low[0]; }
+                                next_texel[0] = next_texel[1];
+                                if BOUNDED { next_low[0] = next_low[1]; }
+                                turns = vec2f(turns.y, 3e38);
+                            }
+                            continuing {
+                                break if left == 0u || transmitted <= TERMINATION;
                             }
                         }
-                        if MODE == MODE_EMISSION_ABSORPTION {
-                            let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
-                            let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
-                            light += transmitted * opacity * share * sum.rgb;
-                            transmitted *= 1.0 - opacity;
-                        }
-                        if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
-                            surface_light = transmitted;
-                            transmitted = 0.0;
-                        }
-                        i += 1.0;
-                        left -= 1u;
-                        if SLOTS == 1u && i >= turns.x {
-                            first_texel[0] = next_texel[0];
-                            low_texel[0] = next_low[0];
-                            next_texel[0] = next_texel[1];
-                            next_low[0] = next_low[1];
-                            turns = vec2f(turns.y, 3e38);
-                        }
-                        continuing {
-                            break if left == 0u || transmitted <= TERMINATION;
-                        }
+                    }
+                    samples -= left * countOneBits(sampled);
+                    if TINTED && (missing & ~hidden) != 0u {
+                        // A thin magenta fog: half the light is gone after 64 voxels.
+                        let voxels = f32(count) * step * voxels_per_depth;
+                        let opacity = 1.0 - exp2(-voxels / 64.0);
+                        light += transmitted * opacity * vec3f(0.6, 0.0, 0.4);
+                        transmitted *= 1.0 - opacity;
+                    }
+                    start += f32(count) * step;
+                    segments += count;
+                    if forgets {
+                        drawn_for[0] = MAX_LEVELS;
+                    }
+                    depth = start + sample_at * min(step, depths.y - start);
+                    if depth >= around || start >= stretch || segments >= doubling || transmitted <= TERMINATION {
+                        break;
                     }
                 }
-                samples -= left * countOneBits(sampled);
-                if (missing & ~hidden) != 0u && false_colors {
-                    // A thin magenta fog: half the light is gone after 64 voxels.
-                    let voxels = f32(count) * step * voxels_per_depth;
-                    let opacity = 1.0 - exp2(-voxels / 64.0);
-                    light += transmitted * opacity * vec3f(0.6, 0.0, 0.4);
-                    transmitted *= 1.0 - opacity;
+                continuing {
+                    going = start < depths.y && transmitted > TERMINATION;
+                    break if lost != 0u || !going || start >= stretch || segments >= doubling;
                 }
-                start += f32(count) * step;
-                segments += count;
-                if forgets {
-                    drawn_for[0] = MAX_LEVELS;
-                }
-                depth = start + sample_at * min(step, depths.y - start);
-                if depth >= around || start >= stretch || segments >= doubling || transmitted <= TERMINATION {
-                    break;
-                }
-            }
-            if lost != 0u {
-                break;
             }
             continuing {
-                going = start < depths.y && transmitted > TERMINATION;
-                break if !going;
+                break if lost != 0u || !going;
             }
         }
         if !going {

@@ -12,7 +12,6 @@ const FIRST_SLOT = 2u;
 const STALE = 0x80000000u;
 
 const FLAG_SUBSTITUTE = 1u;
-const FLAG_FALSE_COLORS = 2u;
 const FLAG_JITTER = 4u;
 const FLAG_OCTREE = 8u;
 const FLAG_NEAREST = 16u;
@@ -47,13 +46,12 @@ const TALLIES = 11u;
 
 const MOST_DEPTHS = 24u;
 const SIBLINGS = 8u;
-const NODE_CHILDREN = 0u;
-const NODE_CHANNEL = 1u;
-const NODE_CHANNEL_WORDS = 4u;
+const NODE_ROW = 4096u;
+const PATH_HOLDS = 8u;
 const NODE_BINS = 0u;
 const NODE_RANGE = 1u;
 const NODE_VALID = 2u;
-const NODE_RESIDENT = 3u;
+const NODE_CHILDREN = 3u;
 
 const MISSES = 4096u;
 const MISSES_PER_RAY = 4u;

@@ -22,7 +22,7 @@ struct Depth {
 // The residency octree as seen from the eye, in cells from the low corner of the anchor cell.
 struct Octree {
     eye: vec3f,
-    node_words: u32,
+    slots: u32,          // texels of a node, one per channel
     anchor: vec3i,       // cell near the eye
     cells_per_nm: vec3f,
     cells: vec3u,        // cells that the volume touches, per axis
