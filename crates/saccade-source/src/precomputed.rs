@@ -4,6 +4,9 @@
 //! levels and channels. Where a store compresses in transport, copies of it in folders are read as well (`NAME.gz`, or
 //! compressed without saying so).
 //!
+//! The finest level is where the volume is; others lie where their `voxel_offset` says, which may be off by less than one of their
+//! voxels, since it is rounded.
+//!
 //! # Values
 //!
 //! As those of [`crate::zarr`]. A volume of type `segmentation` is one of labels: ids that fit into 16 bit stay what they
@@ -26,7 +29,6 @@ use std::sync::Arc;
 
 use glam::{DVec3, UVec3};
 use saccade_core::brick::MAX_LEVELS;
-use saccade_core::levels::Level;
 use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 
 use crate::maybe_send::{BoxFuture, BoxStream};
@@ -43,6 +45,8 @@ use info::Info;
 const CHUNK: UVec3 = UVec3::new(64, 64, 64);
 /// Metadata longer than this are not read \[bytes\].
 const MOST_METADATA: u64 = 16 << 20;
+/// By what share the resolutions of levels may differ from what they would be.
+const ROUNDED: f64 = 1e-3;
 
 /// A precomputed volume.
 pub struct PrecomputedSource {
@@ -91,6 +95,9 @@ impl PrecomputedSource {
             notes.push(format!(
                 "its first voxel is {x}, {y}, {z} elsewhere, and 0, 0, 0 here (voxel_offset)"
             ));
+        }
+        for scale in &info.scales {
+            notes.extend(scale.placed.note(&format!("{:?}", scale.key)));
         }
         let stored = PrecomputedImage::new(objects, volume, info).await;
         let stored = stored.map_err(|source| PrecomputedError::Sample { source })?;
@@ -143,6 +150,7 @@ fn volume(name: &str, info: &Info) -> Result<Volume, Refusal> {
     }
     volume.chunk = CHUNK;
     volume.channels = (0..info.channels).map(|n| format!("channel {n}")).collect();
+    let mut by = DVec3::ONE;
     volume.levels.clear();
     for scale in &info.scales {
         if scale.size.max_element() > MAX_EXTENT {
@@ -151,17 +159,18 @@ fn volume(name: &str, info: &Info) -> Result<Volume, Refusal> {
                 "{size} voxels are more than {MAX_EXTENT} along an axis"
             )));
         }
-        volume.levels.push(Level {
-            extent: scale.size,
-            downsampling: (scale.resolution / finest.resolution).max(DVec3::ONE),
-        });
-    }
-    let coarser = volume.levels.windows(2).all(|pair| {
-        pair[1].downsampling.cmpge(pair[0].downsampling).all()
-            && pair[1].extent.cmple(pair[0].extent).all()
-    });
-    if !coarser {
-        return Err(refused("its levels are not from fine to coarse".to_owned()));
+        let downsampling = scale.resolution / finest.resolution;
+        if (downsampling * (1.0 + ROUNDED)).cmplt(by).any() {
+            return Err(refused("its levels are not from fine to coarse".to_owned()));
+        }
+        by = downsampling.max(by);
+        let level = scale.placed.level(finest.size, by);
+        volume.levels.push(level.ok_or_else(|| {
+            let key = &scale.key;
+            refused(format!(
+                "its level {key:?} lies elsewhere than the finest one (voxel_offset)"
+            ))
+        })?);
     }
     Ok(volume)
 }

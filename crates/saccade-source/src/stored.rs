@@ -4,12 +4,14 @@
 //! once for all who want it, kept while there is room, and given up when nobody waits any more.
 
 mod piece;
+mod placed;
 mod sample;
 
 use std::ops::Range;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
@@ -18,7 +20,8 @@ use crate::maybe_send::{BoxFuture, BoxStream, MaybeSend, MaybeSync};
 use crate::objects::ObjectError;
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 
-pub(crate) use piece::{Place, copy, fill};
+pub(crate) use piece::{ChunkMut, Place, copy, fill};
+pub(crate) use placed::Placed;
 pub(crate) use sample::{Sample, sampled};
 
 /// Decoded chunks that are kept, all levels together \[bytes\].
@@ -94,7 +97,10 @@ pub(crate) trait Stored: MaybeSend + MaybeSync + 'static {
     /// What the image is.
     fn volume(&self) -> &Arc<Volume>;
 
-    /// The pieces that a box of voxels touches, and where each has its voxels.
+    /// Where what is stored of a level lies in it.
+    fn placed(&self, level: u32) -> Placed;
+
+    /// The pieces that a box of stored voxels touches, and where each has its voxels.
     fn touched(&self, channel: u32, level: u32, voxels: VoxelBox) -> Vec<(PieceId, Place)>;
 
     /// Reads pieces, in groups that are best read together.
@@ -119,6 +125,9 @@ impl<F: Stored> StoredSource<F> {
     async fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
         let volume = self.format.volume();
         let voxels = id.voxels(volume).ok_or(ChunkError::OutOfRange { id })?;
+        let Some((voxels, begin)) = self.format.placed(id.level).part(voxels) else {
+            return Ok(Chunk::Empty);
+        };
         let touched = self.format.touched(id.channel, id.level, voxels);
         let ids: Vec<PieceId> = touched.iter().map(|(piece, _)| *piece).collect();
         let pieces = self
@@ -146,10 +155,16 @@ impl<F: Stored> StoredSource<F> {
         }
         let (size, width) = (volume.chunk, volume.dtype.bytes());
         let mut bytes = vec![0; size.as_usizevec3().element_product() * width];
+        let mut chunk = ChunkMut {
+            bytes: &mut bytes,
+            size,
+            width,
+            begin,
+        };
         for (piece, place) in &found {
             match piece {
-                Piece::Uniform(value) => fill(*value, place, voxels, &mut bytes, size, width),
-                Piece::Values(values) => copy(values, place, voxels, &mut bytes, size, width),
+                Piece::Uniform(value) => fill(*value, place, voxels, &mut chunk),
+                Piece::Values(values) => copy(values, place, voxels, &mut chunk),
             }
         }
         if bytes.iter().all(|&byte| byte == 0) {

@@ -8,6 +8,10 @@
 //! translation or identity, alone or in sequence. Transformations that lead from there to others are told in
 //! [`ZarrSource::notes`], not applied; scenes of several images are refused with their names.
 //!
+//! The finest level is where the volume is. Others lie where their transformations say: they may cover a part of it, or more. By up to
+//! half of its voxels a level may be off, since writers mean the middle or the corner of a voxel; what is further away is
+//! told in [`ZarrSource::notes`].
+//!
 //! # Values
 //!
 //! Unsigned integers of 8 and 16 bit are what they are. Signed ones are moved up by half their range, so that
@@ -46,7 +50,6 @@ use std::sync::Arc;
 use futures::future::join_all;
 use glam::{DVec3, UVec3};
 use saccade_core::brick::MAX_LEVELS;
-use saccade_core::levels::Level;
 use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 use serde_json::Value;
 
@@ -65,6 +68,8 @@ pub(crate) use packing::Packing;
 const CHUNK: UVec3 = UVec3::new(64, 64, 64);
 /// Metadata longer than this are not read \[bytes\].
 const MOST_METADATA: u64 = 16 << 20;
+/// By what share the scales of levels may differ from what they would be.
+const ROUNDED: f64 = 1e-3;
 
 /// An OME-Zarr image.
 pub struct ZarrSource {
@@ -133,9 +138,10 @@ impl ZarrSource {
             let level = LevelArray::new(path, array, &image.axes);
             level.map_err(|refusal| refusal.at(objects.location(path)))
         });
-        let levels: Vec<LevelArray> = levels.collect::<Result<_, _>>()?;
-        let volume = volume(name, &image, &levels).map_err(here)?;
+        let mut levels: Vec<LevelArray> = levels.collect::<Result<_, _>>()?;
+        let volume = volume(name, &image, &mut levels).map_err(here)?;
         let mut notes = std::mem::take(&mut image.notes);
+        notes.extend(levels.iter().filter_map(LevelArray::note));
         if !image.has_size {
             notes.push("the image does not say how large its voxels are; they are taken for 1 micrometer where it does not".to_owned());
         }
@@ -242,7 +248,7 @@ fn lies_in_labels(folders: &[String]) -> bool {
 }
 
 /// The volume that an image is.
-fn volume(name: &str, image: &Image, levels: &[LevelArray]) -> Result<Volume, Refusal> {
+fn volume(name: &str, image: &Image, levels: &mut [LevelArray]) -> Result<Volume, Refusal> {
     let refused = |reason: &str| Refusal::Unsupported(reason.to_owned());
     let finest = levels.first().ok_or_else(|| refused("it has no levels"))?;
     let volume = Volume::new(&volume_name(name), finest.extent(), image.voxel_nm);
@@ -267,9 +273,11 @@ fn volume(name: &str, image: &Image, levels: &[LevelArray]) -> Result<Volume, Re
             _ => format!("channel {index}"),
         })
         .collect();
+    let (kind, channels, extent) = (finest.number(), finest.channels(), finest.extent());
+    let mut by = DVec3::ONE;
     volume.levels.clear();
-    for (level, downsampling) in levels.iter().zip(&image.downsampling) {
-        if level.number() != finest.number() || level.channels() != finest.channels() {
+    for (n, level) in levels.iter_mut().enumerate() {
+        if level.number() != kind || level.channels() != channels {
             return Err(refused("its levels differ in type or channels"));
         }
         if level.extent().max_element() > MAX_EXTENT {
@@ -279,19 +287,15 @@ fn volume(name: &str, image: &Image, levels: &[LevelArray]) -> Result<Volume, Re
             )));
         }
         // What the transformations say, or, where they say nothing, what the sizes do.
-        let by_size = finest.extent().as_dvec3() / level.extent().as_dvec3();
-        let downsampling = downsampling.unwrap_or(by_size);
-        volume.levels.push(Level {
-            extent: level.extent(),
-            downsampling: downsampling.max(DVec3::ONE),
-        });
-    }
-    let coarser = volume.levels.windows(2).all(|pair| {
-        pair[1].downsampling.cmpge(pair[0].downsampling).all()
-            && pair[1].extent.cmple(pair[0].extent).all()
-    });
-    if !coarser {
-        return Err(refused("its levels are not from fine to coarse"));
+        let by_size = extent.as_dvec3() / level.extent().as_dvec3();
+        let downsampling = image.downsampling[n].unwrap_or(by_size);
+        if (downsampling * (1.0 + ROUNDED)).cmplt(by).any() {
+            return Err(refused("its levels are not from fine to coarse"));
+        }
+        by = downsampling.max(by);
+        // The corner of all voxels, while transformations place the middle of one.
+        let corner = (image.first[n] - (by - 1.0) / 2.0) / by;
+        volume.levels.push(level.place(corner, extent, by)?);
     }
     Ok(volume)
 }

@@ -18,7 +18,7 @@ use crate::decoding::{self, Decoding, decode};
 use crate::flights::{Flights, Work};
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, sampled,
+    Piece, PieceError, PieceId, Pieces, Place, Placed, Sample, Stored, coalesced, sampled,
 };
 use crate::values::Values;
 
@@ -363,6 +363,10 @@ impl PrecomputedImage {
 impl Stored for PrecomputedImage {
     fn volume(&self) -> &Arc<Volume> {
         &self.volume
+    }
+
+    fn placed(&self, level: u32) -> Placed {
+        self.scale(level).placed
     }
 
     fn touched(&self, channel: u32, level: u32, voxels: VoxelBox) -> Vec<(PieceId, Place)> {

@@ -1,14 +1,17 @@
 //! What an `info` says of its volume.
 
-use glam::{DVec3, UVec3};
+use glam::{DVec3, I64Vec3, UVec3};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::error::Refusal;
+use crate::stored::Placed;
 use crate::values::Number;
 
 /// Chunks that are larger than this when decoded are refused \[bytes\].
 const MOST_CHUNK: u64 = 1 << 30;
+/// How far off a level may be because its offset is a whole number, rounded from level to level \[voxels of the level\].
+const ROUNDED: f64 = 0.999;
 /// Levels that are looked at.
 const MOST_SCALES: usize = 64;
 
@@ -31,6 +34,8 @@ pub(super) struct Scale {
     pub(super) size: UVec3,
     /// First voxel, as chunks' names count.
     pub(super) offset: [i64; 3],
+    /// Where that is in the volume, which begins where its finest level does.
+    pub(super) placed: Placed,
     /// \[nm\]
     pub(super) resolution: DVec3,
     pub(super) chunk: UVec3,
@@ -63,6 +68,11 @@ impl Scale {
     /// Chunks along each axis.
     pub(super) fn grid(&self) -> UVec3 {
         (self.size + (self.chunk - 1)) / self.chunk
+    }
+
+    /// Of its first voxel, in the space of all levels.
+    fn corner_nm(&self) -> DVec3 {
+        I64Vec3::from(self.offset).as_dvec3() * self.resolution
     }
 }
 
@@ -118,6 +128,11 @@ impl Info {
                 .element_product()
                 .total_cmp(&b.resolution.element_product())
         });
+        let begin = scales[0].corner_nm();
+        for scale in &mut scales {
+            let corner = (scale.corner_nm() - begin) / scale.resolution;
+            scale.placed = Placed::new(scale.size, corner, ROUNDED);
+        }
         Ok(Self {
             number,
             channels,
@@ -208,6 +223,7 @@ impl Scale {
             key: key.to_owned(),
             size,
             offset,
+            placed: Placed::new(size, DVec3::ZERO, 0.0),
             resolution,
             chunk,
             encoding,

@@ -99,6 +99,66 @@ async fn levels_and_first_voxels_are_as_the_info_says() {
     );
 }
 
+/// The second level is named as if it began elsewhere; what it holds is not moved.
+#[tokio::test]
+async fn levels_lie_where_their_offsets_say() {
+    let folder = tempfile::tempdir().unwrap();
+    let value = |at: UVec3| u8::try_from(busy(at, 0)).unwrap();
+    let write = |key: &str, begin: [i64; 3], size: UVec3| {
+        let ends = (0..3).map(|n| format!("{}-{}", begin[n], begin[n] + i64::from(size[n])));
+        let name = ends.collect::<Vec<_>>().join("_");
+        std::fs::create_dir_all(folder.path().join(key)).unwrap();
+        let bytes: Vec<u8> = VoxelBox::of_size(size).iter().map(value).collect();
+        std::fs::write(folder.path().join(key).join(name), bytes).unwrap();
+    };
+    let coarse = UVec3::new(23, 16, 11);
+    write("s0", [7, -20, 3], SIZE);
+    // Where it belongs is 3.5, -10, 3, which is rounded.
+    for (n, (begin, at)) in [([3, -10, 3], [0; 3]), ([8, -13, 3], [5, -3, 0])]
+        .into_iter()
+        .enumerate()
+    {
+        let key = format!("s1{n}");
+        write(&key, begin, coarse);
+        let scale = |key: &str, by: u32, size: UVec3, offset: [i64; 3]| {
+            json!({"key": key, "size": size.to_array(), "chunk_sizes": [size.to_array()], "encoding": "raw",
+                "resolution": [8 * by, 8 * by, 40], "voxel_offset": offset})
+        };
+        let scales = [
+            scale("s0", 1, SIZE, [7, -20, 3]),
+            scale(&key, 2, coarse, begin),
+        ];
+        let info = json!({"@type": "neuroglancer_multiscale_volume", "type": "image", "data_type": "uint8",
+            "num_channels": 1, "scales": scales});
+        std::fs::write(folder.path().join("info"), info.to_string()).unwrap();
+        let objects = FolderObjects::new(folder.path());
+        let source = PrecomputedSource::open(Arc::new(objects), "moved")
+            .await
+            .unwrap();
+        let volume = source.volume().clone();
+        let oracle = |id: ChunkId, off: glam::IVec3| {
+            let size = if id.level == 0 { SIZE } else { coarse };
+            let begin = if id.level == 0 {
+                glam::IVec3::ZERO
+            } else {
+                off
+            };
+            chunk(&volume, id, |at, _| {
+                let own = at.as_ivec3() - begin;
+                let inside = own.cmpge(glam::IVec3::ZERO).all() && own.as_uvec3().cmplt(size).all();
+                if inside { busy(own.as_uvec3(), 0) } else { 0 }
+            })
+        };
+        check_reading(&source, |id| oracle(id, at.into()), 0)
+            .await
+            .unwrap();
+        let wrong = |id| oracle(id, glam::IVec3::from(at) + glam::IVec3::Y);
+        assert!(check_reading(&source, wrong, 0).await.is_err());
+        let note = source.notes().join(" ");
+        assert_eq!(note.contains("begins 5, -3, 0"), n == 1, "{note}");
+    }
+}
+
 #[tokio::test]
 async fn pictures_that_lose_a_little_lose_a_little() {
     for (name, channels) in [("jpeg", 1), ("jpeg_colour", 3)] {

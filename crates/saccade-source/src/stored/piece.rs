@@ -24,21 +24,44 @@ impl Place {
             .map(|(n, stride)| (*n as usize - 1) * stride);
         self.offset + last.sum::<usize>() + 1
     }
+
+    /// Whether a piece has exactly these voxels, as a chunk of `size` that they fill has them.
+    pub(crate) fn is(&self, voxels: VoxelBox, size: UVec3) -> bool {
+        let [sx, sy, _] = size.to_array().map(|n| n as usize);
+        let whole = self.voxels == voxels && voxels.size() == size;
+        whole && self.strides == [1, sx, sx * sy] && self.offset == 0
+    }
 }
 
-/// Copies what a piece has of `wanted` into a chunk of `size` that begins where `wanted` does.
+/// A chunk that is put together, x fastest.
+#[derive(Debug)]
+pub(crate) struct ChunkMut<'a> {
+    pub(crate) bytes: &'a mut [u8],
+    /// \[voxels\]
+    pub(crate) size: UVec3,
+    /// Bytes of a value.
+    pub(crate) width: usize,
+    /// Its voxel from which on there is something.
+    pub(crate) begin: UVec3,
+}
+
+impl ChunkMut<'_> {
+    /// `count` voxels in a row, the first of them `to` from where something begins.
+    fn row(&mut self, to: UVec3, count: usize) -> &mut [u8] {
+        let [x, y, z] = (self.begin + to).to_array().map(|n| n as usize);
+        let [sx, sy, _] = self.size.to_array().map(|n| n as usize);
+        let at = (z * sy + y) * sx + x;
+        &mut self.bytes[at * self.width..][..count * self.width]
+    }
+}
+
+/// Copies what a piece has of `wanted`, which is what there is in a chunk.
 ///
 /// # Panics
 ///
 /// If the piece is shorter than its place.
-pub(crate) fn copy(
-    values: &[u8],
-    place: &Place,
-    wanted: VoxelBox,
-    chunk: &mut [u8],
-    size: UVec3,
-    width: usize,
-) {
+pub(crate) fn copy(values: &[u8], place: &Place, wanted: VoxelBox, chunk: &mut ChunkMut<'_>) {
+    let width = chunk.width;
     assert!(
         values.len() >= place.reach() * width,
         "a piece has all its values"
@@ -50,26 +73,25 @@ pub(crate) fn copy(
     ) else {
         return;
     };
-    let [nx, ny, nz] = both.size().to_array().map(|n| n as usize);
     let [fx, fy, fz] = from.to_array().map(|n| n as usize);
     let first =
         place.offset + fx * place.strides[0] + fy * place.strides[1] + fz * place.strides[2];
-    for z in 0..nz {
-        for y in 0..ny {
-            let from = (first + y * place.strides[1] + z * place.strides[2]) * width;
-            let row = row(chunk, to, y, z, nx, size, width);
-            match (place.strides[0], width) {
-                (1, _) => row.copy_from_slice(&values[from..][..nx * width]),
-                (stride, 1) => {
-                    for (to, from) in row.iter_mut().zip(values[from..].iter().step_by(stride)) {
-                        *to = *from;
-                    }
+    let nx = both.size().x as usize;
+    for row in rows(both) {
+        let [y, z] = [row.y, row.z].map(|n| n as usize);
+        let from = (first + y * place.strides[1] + z * place.strides[2]) * width;
+        let row = chunk.row(to + row, nx);
+        match (place.strides[0], width) {
+            (1, _) => row.copy_from_slice(&values[from..][..nx * width]),
+            (stride, 1) => {
+                for (to, from) in row.iter_mut().zip(values[from..].iter().step_by(stride)) {
+                    *to = *from;
                 }
-                (stride, _) => {
-                    let from = values[from..].chunks(stride * width);
-                    for (to, from) in row.chunks_exact_mut(width).zip(from) {
-                        to.copy_from_slice(&from[..width]);
-                    }
+            }
+            (stride, _) => {
+                let from = values[from..].chunks(stride * width);
+                for (to, from) in row.chunks_exact_mut(width).zip(from) {
+                    to.copy_from_slice(&from[..width]);
                 }
             }
         }
@@ -77,41 +99,20 @@ pub(crate) fn copy(
 }
 
 /// Like [`copy`], of a piece that has the same value everywhere.
-pub(crate) fn fill(
-    value: u16,
-    place: &Place,
-    wanted: VoxelBox,
-    chunk: &mut [u8],
-    size: UVec3,
-    width: usize,
-) {
+pub(crate) fn fill(value: u16, place: &Place, wanted: VoxelBox, chunk: &mut ChunkMut<'_>) {
     let both = place.voxels.intersection(wanted);
     let Some(to) = both.min.checked_sub(wanted.min) else {
         return;
     };
-    let [nx, ny, nz] = both.size().to_array().map(|n| n as usize);
-    for z in 0..nz {
-        for y in 0..ny {
-            let row = row(chunk, to, y, z, nx, size, width);
-            for voxel in row.chunks_exact_mut(width) {
-                voxel.copy_from_slice(&value.to_le_bytes()[..width]);
-            }
+    let (nx, width) = (both.size().x as usize, chunk.width);
+    for row in rows(both) {
+        for voxel in chunk.row(to + row, nx).chunks_exact_mut(width) {
+            voxel.copy_from_slice(&value.to_le_bytes()[..width]);
         }
     }
 }
 
-/// `count` voxels of a chunk, from `to` on, `y` rows and `z` sections further.
-fn row(
-    chunk: &mut [u8],
-    to: UVec3,
-    y: usize,
-    z: usize,
-    count: usize,
-    size: UVec3,
-    width: usize,
-) -> &mut [u8] {
-    let [x0, y0, z0] = to.to_array().map(|n| n as usize);
-    let [sx, sy, _] = size.to_array().map(|n| n as usize);
-    let at = ((z0 + z) * sy + y0 + y) * sx + x0;
-    &mut chunk[at * width..][..count * width]
+/// Where the rows of a box begin, from its first voxel.
+fn rows(voxels: VoxelBox) -> impl Iterator<Item = UVec3> {
+    VoxelBox::of_size(voxels.size().with_x(1)).iter()
 }

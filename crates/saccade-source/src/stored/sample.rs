@@ -3,7 +3,7 @@
 use glam::UVec3;
 use saccade_core::voxel_box::VoxelBox;
 
-use super::{Place, copy};
+use super::{ChunkMut, Place, copy};
 use crate::values::{Number, Spread, Values};
 
 /// Pieces and bytes that are looked at.
@@ -58,7 +58,13 @@ impl Sample {
     pub(crate) fn add(&mut self, stored: &[u8], place: &Place, number: Number, big_endian: bool) {
         let (size, width) = (place.voxels.size(), number.bytes());
         let mut inside = vec![0; size.as_usizevec3().element_product() * width];
-        copy(stored, place, place.voxels, &mut inside, size, width);
+        let mut all = ChunkMut {
+            bytes: &mut inside,
+            size,
+            width,
+            begin: UVec3::ZERO,
+        };
+        copy(stored, place, place.voxels, &mut all);
         if let Some(new) = Values::spread(number, big_endian, &inside) {
             self.widen(new);
         }

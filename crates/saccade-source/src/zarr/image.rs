@@ -6,7 +6,8 @@ use std::sync::Arc;
 use bytes::Bytes;
 use futures::StreamExt as _;
 use futures::stream;
-use glam::UVec3;
+use glam::{DVec3, UVec3};
+use saccade_core::levels::Level;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
@@ -21,7 +22,7 @@ use crate::decoding::{self, Decoding, decode};
 use crate::flights::{Flights, Work};
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    Piece, PieceError, PieceId, Pieces, Place, Sample, Stored, coalesced, sampled,
+    Piece, PieceError, PieceId, Pieces, Place, Placed, Sample, Stored, coalesced, sampled,
 };
 use crate::values::{Number, Values};
 
@@ -29,6 +30,8 @@ use crate::values::{Number, Values};
 const INDEX_CACHE: u64 = 64 << 20;
 /// Ranges of a shard that are read at once.
 const RANGES_AT_ONCE: usize = 8;
+/// How far off a level may be because its writer meant another point of its voxels \[voxels of the level\].
+const MEANT_OTHERWISE: f64 = 0.501;
 
 /// A level: an array whose axes are known.
 #[derive(Debug)]
@@ -39,6 +42,7 @@ pub(super) struct LevelArray {
     axes: Vec<Axis>,
     grid: Vec<u64>,
     extent: UVec3,
+    placed: Placed,
     channels: u32,
     /// Values between neighbours along each axis of the array, in a decoded chunk.
     strides: Vec<usize>,
@@ -76,9 +80,32 @@ impl LevelArray {
             array: Arc::new(array),
             axes: axes.to_vec(),
             extent,
+            placed: Placed::new(extent, DVec3::ZERO, 0.0),
             channels,
             strides,
         })
+    }
+
+    /// Puts it where its first corner lies, from that of a volume of so many voxels, of which one of its own is so many: the
+    /// level that it is then.
+    pub(super) fn place(
+        &mut self,
+        corner: DVec3,
+        finest: UVec3,
+        downsampling: DVec3,
+    ) -> Result<Level, Refusal> {
+        self.placed = Placed::new(self.extent, corner, MEANT_OTHERWISE);
+        self.placed.level(finest, downsampling).ok_or_else(|| {
+            let path = &self.path;
+            Refusal::Unsupported(format!(
+                "its level {path:?} lies elsewhere than the finest one (translation)"
+            ))
+        })
+    }
+
+    /// What a user should know of where it lies.
+    pub(super) fn note(&self) -> Option<String> {
+        self.placed.note(&format!("{:?}", self.path))
     }
 
     pub(super) fn extent(&self) -> UVec3 {
@@ -93,7 +120,7 @@ impl LevelArray {
         self.array.number
     }
 
-    /// Chunks that a box of a channel touches: their numbers, and where they have their voxels.
+    /// Chunks that a box of a channel's stored voxels touches: their numbers, and where they have their voxels.
     fn touched(&self, channel: u32, voxels: VoxelBox) -> Vec<(u64, Place)> {
         let mut index = vec![0; self.axes.len()];
         let mut offset = 0;
@@ -484,6 +511,10 @@ impl ZarrImage {
 impl Stored for ZarrImage {
     fn volume(&self) -> &Arc<Volume> {
         &self.volume
+    }
+
+    fn placed(&self, level: u32) -> Placed {
+        self.levels[level as usize].placed
     }
 
     fn touched(&self, channel: u32, level: u32, voxels: VoxelBox) -> Vec<(PieceId, Place)> {

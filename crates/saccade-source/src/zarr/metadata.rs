@@ -28,6 +28,8 @@ pub(super) struct Image {
     pub(super) has_size: bool,
     /// Finest voxels per voxel, by level, where transformations tell.
     pub(super) downsampling: Vec<Option<DVec3>>,
+    /// Middle of each level's first voxel, from that of the finest's \[finest voxels\].
+    pub(super) first: Vec<DVec3>,
     /// Channels, as far as anything is said of them.
     pub(super) channels: Vec<Channel>,
     /// Whether it says that its values name things.
@@ -143,12 +145,14 @@ impl Image {
         let datasets = multiscale["datasets"].as_array().into_iter().flatten();
         let placed = datasets.map(|dataset| &dataset["coordinateTransformations"]);
         let placed: Vec<&Value> = placed.collect();
-        let scales = placed.iter().map(|list| scale(&axes, list));
-        let scales: Vec<Option<DVec3>> = scales.collect();
-        let of_all = { space.of_all }
-            .and_then(|transformations| scale(&axes, transformations))
-            .unwrap_or(DVec3::ONE);
-        let finest = scales.first().copied().flatten();
+        let ways = placed.iter().map(|list| way(&axes, list));
+        let ways: Vec<Way> = ways.collect::<Result<_, _>>()?;
+        // Where it moves all, it moves nothing here.
+        let of_all = { space.of_all }.map(|transformations| way(&axes, transformations));
+        let of_all = { of_all.transpose()? }.and_then(|way| way.scale);
+        let of_all = of_all.unwrap_or(DVec3::ONE);
+        let begin = ways.first().map_or(DVec3::ZERO, |way| way.first);
+        let finest = ways.first().and_then(|way| way.scale);
         let units = named.and_then(|named| units(named, &axes));
         let says_size = finest.is_some() || placed.first().is_some_and(|list| space::stays(list));
         let has_size = says_size && units.is_some();
@@ -161,14 +165,15 @@ impl Image {
             let reason = "its voxels have no size (coordinateTransformations)";
             return Err(Refusal::wrong(reason));
         }
-        let downsampling = scales.into_iter();
-        let downsampling =
-            downsampling.map(|scale| Some(scale? / finest).filter(|d| d.is_finite()));
+        let downsampling = |way: &Way| Some(way.scale? / finest).filter(|d| d.is_finite());
         let channels = ome["omero"]["channels"].as_array().into_iter().flatten();
         Ok(Self {
             voxel_nm,
             has_size,
-            downsampling: downsampling.collect(),
+            downsampling: ways.iter().map(downsampling).collect(),
+            first: { ways.iter() }
+                .map(|way| (way.first - begin) / finest)
+                .collect(),
             channels: channels.map(channel).collect(),
             is_labels: ome["image-label"].is_object(),
             notes: space.notes,
@@ -253,16 +258,41 @@ fn axes(named: Option<&Vec<Value>>, rank: usize) -> Result<Vec<Axis>, Refusal> {
     Ok(axes)
 }
 
-/// The scale of a list of transformations, x, y, z; 1 for an axis that there is not.
-fn scale(axes: &[Axis], transformations: &Value) -> Option<DVec3> {
-    let scale = space::simple(transformations).find_map(|t| t["scale"].as_array())?;
-    let mut result = DVec3::ONE;
-    for (axis, value) in axes.iter().zip(scale) {
-        if let Axis::Space(axis) = axis {
-            result[*axis] = value.as_f64()?;
+/// Where a list of transformations puts voxels, x, y, z.
+struct Way {
+    /// Size of one; `None` if that is not said.
+    scale: Option<DVec3>,
+    /// Middle of the first.
+    first: DVec3,
+}
+
+/// That of all of them, one after the other. Of an axis that there is not, nothing is done.
+fn way(axes: &[Axis], transformations: &Value) -> Result<Way, Refusal> {
+    let numbers = |list: &Value, missing: f64| {
+        let list = list.as_array().filter(|list| list.len() == axes.len())?;
+        let mut numbers = DVec3::splat(missing);
+        for (axis, value) in axes.iter().zip(list) {
+            if let Axis::Space(axis) = axis {
+                numbers[*axis] = value.as_f64()?;
+            }
+        }
+        Some(numbers)
+    };
+    let (mut scale, mut first) = (None, DVec3::ZERO);
+    for one in space::simple(transformations) {
+        if one["type"] == "translation" {
+            let moved = numbers(&one["translation"], 0.0);
+            first += moved.ok_or_else(|| {
+                let reason =
+                    "a translation has no number for each axis (coordinateTransformations)";
+                Refusal::wrong(reason)
+            })?;
+        } else if let Some(by) = numbers(&one["scale"], 1.0) {
+            first *= by;
+            scale = Some(scale.unwrap_or(DVec3::ONE) * by);
         }
     }
-    (scale.len() == axes.len()).then_some(result)
+    Ok(Way { scale, first })
 }
 
 /// Nanometres in the units of x, y, z; `None` where one has none.

@@ -3,6 +3,7 @@
 
 mod hostile;
 mod labels;
+mod places;
 mod systems;
 mod written;
 

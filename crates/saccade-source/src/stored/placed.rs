@@ -1,0 +1,146 @@
+//! Where the voxels that are stored of a level lie in the level.
+
+use glam::{DVec3, I64Vec3, UVec3};
+use saccade_core::levels::Level;
+use saccade_core::voxel_box::VoxelBox;
+
+/// Where a stored array begins in the level that it is of, and how large it is \[voxels of the level\].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Placed {
+    begin: I64Vec3,
+    size: UVec3,
+}
+
+impl Placed {
+    /// One of `size` voxels whose first corner lies `corner` of its voxels from the volume's. No more than `slack` of them is
+    /// what writers round, or mean differently: it counts as none.
+    pub(crate) fn new(size: UVec3, corner: DVec3, slack: f64) -> Self {
+        let begin = corner.to_array().map(|voxels| {
+            // Saturates: what is that far away is nowhere in the volume.
+            #[expect(
+                clippy::cast_possible_truncation,
+                reason = "rounded; beyond that it saturates"
+            )]
+            let whole = voxels.round() as i64;
+            let is_none = voxels.is_nan() || voxels.abs() <= slack;
+            if is_none { 0 } else { whole }
+        });
+        Self {
+            begin: begin.into(),
+            size,
+        }
+    }
+
+    /// The level that it is of, in a volume of `finest` voxels; `None` if it has nothing of it. Where it covers the volume,
+    /// the level ends as it does, whichever way it was rounded.
+    pub(crate) fn level(&self, finest: UVec3, downsampling: DVec3) -> Option<Level> {
+        let mut extent = self.size;
+        for axis in 0..3 {
+            let (whole, by) = (f64::from(finest[axis]), downsampling[axis]);
+            let covers = (f64::from(self.size[axis]) * by - whole).abs() < by;
+            if self.begin[axis] != 0 || !covers {
+                #[expect(
+                    clippy::cast_possible_truncation,
+                    clippy::cast_sign_loss,
+                    reason = "from 1 to the finest's extent"
+                )]
+                let voxels = (whole / by - 1e-6).ceil().max(1.0) as u32;
+                extent[axis] = voxels;
+            }
+        }
+        let level = Level {
+            extent,
+            downsampling,
+        };
+        { self.part(VoxelBox::of_size(extent)) }.map(|_| level)
+    }
+
+    /// What it has of a box of the level: in its own voxels, and where that begins within the box.
+    pub(crate) fn part(&self, voxels: VoxelBox) -> Option<(VoxelBox, UVec3)> {
+        let first = voxels.min.as_i64vec3();
+        let end = voxels.max.as_i64vec3().saturating_sub(self.begin);
+        let min = first.saturating_sub(self.begin).max(I64Vec3::ZERO);
+        let max = end.min(self.size.as_i64vec3());
+        if min.cmpge(max).any() {
+            return None;
+        }
+        let inside = min.saturating_add(self.begin) - first;
+        let own = VoxelBox::new(min.as_uvec3(), max.as_uvec3());
+        Some((own, inside.as_uvec3()))
+    }
+
+    /// Where it begins, if that is not where the volume does, in words about a level of this name.
+    pub(crate) fn note(&self, level: &str) -> Option<String> {
+        let [x, y, z] = self.begin.to_array();
+        (self.begin != I64Vec3::ZERO).then(|| {
+            format!(
+                "its level {level} begins {x}, {y}, {z} of its voxels (x, y, z) from where the finest does, and is shown there"
+            )
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FINEST: UVec3 = UVec3::new(101, 91, 9);
+    const BY: DVec3 = DVec3::new(4.0, 2.0, 1.0);
+
+    fn placed(size: [u32; 3], corner: [f64; 3]) -> Placed {
+        Placed::new(size.into(), corner.into(), 0.5)
+    }
+
+    #[test]
+    fn what_covers_the_volume_is_the_level() {
+        // Rounded down and up, and moved by what is rounded.
+        for size in [[25, 45, 9], [26, 46, 9], [25, 46, 9]] {
+            let placed = placed(size, [0.5, -0.4, f64::NAN]);
+            let level = placed.level(FINEST, BY).unwrap();
+            assert_eq!(level.extent.to_array(), size);
+            let all = VoxelBox::of_size(level.extent);
+            assert_eq!(placed.part(all), Some((all, UVec3::ZERO)));
+            assert!(placed.note("1").is_none());
+        }
+    }
+
+    #[test]
+    fn what_lies_elsewhere_is_part_of_the_level() {
+        let placed = placed([10, 100, 4], [3.2, -7.0, 6.0]);
+        let level = placed.level(FINEST, BY).unwrap();
+        assert_eq!(level.extent, UVec3::new(26, 46, 9));
+        let note = placed.note("\"s1\"").unwrap();
+        assert!(note.contains("\"s1\" begins 3, -7, 6 of"), "{note}");
+        let part = |min: [u32; 3], max: [u32; 3]| {
+            let part = placed.part(VoxelBox::new(min.into(), max.into()));
+            part.map(|(own, at)| (own.min.to_array(), own.max.to_array(), at.to_array()))
+        };
+        assert_eq!(
+            part([0, 0, 0], [25, 45, 9]),
+            Some(([0, 7, 0], [10, 52, 3], [3, 0, 6]))
+        );
+        assert_eq!(
+            part([5, 4, 8], [8, 5, 9]),
+            Some(([2, 11, 2], [5, 12, 3], [0, 0, 0]))
+        );
+        assert_eq!(part([0, 0, 0], [3, 45, 9]), None);
+        assert_eq!(part([13, 0, 0], [25, 45, 9]), None);
+    }
+
+    #[test]
+    fn what_has_nothing_of_the_volume_is_no_level_of_it() {
+        for corner in [
+            [26.0, 0.0, 0.0],
+            [-25.0, 0.0, 0.0],
+            [0.0, 0.0, 1e300],
+            [0.0, -1e300, 0.0],
+        ] {
+            assert_eq!(placed([25, 45, 9], corner).level(FINEST, BY), None);
+        }
+        assert!(
+            placed([25, 45, 9], [24.0, 0.0, 0.0])
+                .level(FINEST, BY)
+                .is_some()
+        );
+    }
+}
