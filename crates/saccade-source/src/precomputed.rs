@@ -1,7 +1,7 @@
 //! Neuroglancer's precomputed volumes, wherever [`crate::objects`] reach.
 //!
 //! Chunks may be raw, jpeg, png or `compressed_segmentation`, in objects of their own or in shards, of any number of
-//! levels and channels. Where a store compresses in transport, copies of it in folders are read as well (`NAME.gz`, or
+//! levels and channels. Where a store compresses in transport, copies of it are read as well, in folders and over HTTP (`NAME.gz`, or
 //! compressed without saying so).
 //!
 //! The finest level is where the volume is; others lie where their `voxel_offset` says, which may be off by less than one of their

@@ -1,7 +1,7 @@
 //! The voxels of a volume: which of its chunks they are in, and how those are read.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use bytes::Bytes;
 use futures::StreamExt as _;
@@ -37,6 +37,17 @@ pub(super) struct PrecomputedImage {
     info: Info,
     values: Arc<Values>,
     indices: Arc<Flights<IndexId, Option<Index>, PieceError>>,
+    /// How the first chunk was called that there was.
+    names: OnceLock<Name>,
+}
+
+/// How the object of a chunk is called.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Name {
+    /// As the format says.
+    Plain,
+    /// `NAME.gz`: as copies of stores that compress in transport have it, and servers that decompress do not.
+    Zipped,
 }
 
 impl PrecomputedImage {
@@ -52,6 +63,7 @@ impl PrecomputedImage {
             info,
             values: Arc::new(Values::fitted(number, false, None)),
             indices: Flights::new(INDEX_CACHE, 4096),
+            names: OnceLock::new(),
         };
         let names = { image.info.is_segmentation }.then(|| Values::names(number, false));
         let known = { names.flatten() }.or_else(|| Values::kept(number, false));
@@ -215,17 +227,30 @@ impl PrecomputedImage {
             let to = scale.offset[n] + i64::from(voxels.max[n]);
             format!("{from}-{to}")
         };
-        let mut key = format!("{}/{}_{}_{}", scale.key, axis(0), axis(1), axis(2));
+        let key = format!("{}/{}_{}_{}", scale.key, axis(0), axis(1), axis(2));
         let part = Part::Whole { most };
-        let mut bytes = self.part(id, &key, part.clone()).await?;
-        if bytes.is_none() && !self.objects.is_remote() {
-            key += ".gz";
-            bytes = self.part(id, &key, part.clone()).await?;
+        // Of remote volumes whose chunks are known to be plain, one that is missing is asked for once.
+        let names = match (self.names(), self.objects.is_remote()) {
+            (Some(Name::Plain), true) => vec![Name::Plain],
+            (Some(Name::Zipped), _) => vec![Name::Zipped, Name::Plain],
+            _ => vec![Name::Plain, Name::Zipped],
+        };
+        for name in names {
+            let key = match name {
+                Name::Plain => key.clone(),
+                Name::Zipped => format!("{key}.gz"),
+            };
+            if let Some(bytes) = self.part(id, &key, part.clone()).await? {
+                // Whichever is the first.
+                let _ = self.names.set(name);
+                return self.decoded(id, &key, part, bytes, values).await;
+            }
         }
-        match bytes {
-            None => Ok(None),
-            Some(bytes) => self.decoded(id, &key, part, bytes, values).await,
-        }
+        Ok(None)
+    }
+
+    fn names(&self) -> Option<Name> {
+        self.names.get().copied()
     }
 
     fn number_in_shards(&self, id: PieceId) -> u64 {

@@ -361,6 +361,43 @@ async fn damage_is_told_and_what_passes_is_read_again() {
     }
 }
 
+/// Copies of stores that compress in transport, behind a server that knows nothing of that.
+#[tokio::test]
+async fn chunks_that_are_called_gz_are_found() {
+    let server = TestServer::of_folder(&fixture("segments")).await;
+    let id = ChunkId {
+        channel: 0,
+        level: 0,
+        chunk: UVec3::ZERO,
+    };
+    let read = async || {
+        server.log.lock().unwrap().clear();
+        let objects = Arc::new(HttpObjects::new(&server.url).unwrap());
+        let source = PrecomputedSource::open(objects, "segments").await.unwrap();
+        source.read(id).await.unwrap()
+    };
+    let good = read().await;
+    assert_eq!(server.asked(".gz"), 0);
+    let objects = server.objects.lock().unwrap().clone();
+    let chunks = objects.keys().filter(|key| key.starts_with("s0/"));
+    let names: Vec<String> = chunks.cloned().collect();
+    assert_eq!(names.len(), 27);
+    // What is missing among others that are there is asked for by both names at most once.
+    server.objects.lock().unwrap().remove(&names[0]);
+    assert!(read().await != good);
+    assert!(server.asked(".gz") <= 1);
+    let mut objects = objects;
+    for name in &names {
+        let bytes = objects.remove(name).unwrap();
+        let mut zip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        std::io::Write::write_all(&mut zip, &bytes).unwrap();
+        objects.insert(format!("{name}.gz"), zip.finish().unwrap().into());
+    }
+    *server.objects.lock().unwrap() = objects;
+    assert!(read().await == good);
+    assert_eq!(server.asked(".gz"), 27);
+}
+
 /// Segmentations of a real brain by cloud-volume and tensorstore, if they are there.
 #[tokio::test]
 async fn real_volumes_open() {
