@@ -24,8 +24,12 @@ pub(crate) use piece::{ChunkMut, Place, copy, fill};
 pub(crate) use placed::Placed;
 pub(crate) use sample::{Sample, sampled};
 
-/// Decoded chunks that are kept, all levels together \[bytes\].
-const CACHE_BYTES: u64 = 512 << 20;
+/// Decoded chunks that are kept, all levels together \[bytes\]. A page has 4 GB at most, and shares it with what it shows.
+const CACHE_BYTES: u64 = if cfg!(target_family = "wasm") {
+    128 << 20
+} else {
+    512 << 20
+};
 /// Longest range that is read at once \[bytes\], unless a single chunk is longer.
 const MOST_AT_ONCE: u64 = 8 << 20;
 
