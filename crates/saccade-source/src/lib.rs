@@ -35,6 +35,8 @@ pub mod memory;
 pub mod objects;
 pub mod ome;
 pub mod precomputed;
+#[cfg(not(target_family = "wasm"))]
+mod processors;
 pub mod remote;
 mod source;
 #[cfg(not(target_family = "wasm"))]

@@ -158,25 +158,43 @@ impl<F: Stored> StoredSource<F> {
             return Ok(Chunk::Empty);
         }
         let (size, width) = (volume.chunk, volume.dtype.bytes());
-        let mut bytes = vec![0; size.as_usizevec3().element_product() * width];
-        let mut chunk = ChunkMut {
-            bytes: &mut bytes,
-            size,
-            width,
-            begin,
-        };
-        for (piece, place) in &found {
-            match piece {
-                Piece::Uniform(value) => fill(*value, place, voxels, &mut chunk),
-                Piece::Values(values) => copy(values, place, voxels, &mut chunk),
+        let length = size.as_usizevec3().element_product() * width;
+        let bytes = match &*found {
+            // It is the chunk: nothing is copied.
+            [(Piece::Values(values), place)]
+                if values.len() == length && begin == UVec3::ZERO && place.is(voxels, size) =>
+            {
+                values.clone()
             }
-        }
-        if bytes.iter().all(|&byte| byte == 0) {
-            Ok(Chunk::Empty)
-        } else {
-            Ok(Chunk::Voxels(bytes.into()))
-        }
+            _ => {
+                let mut bytes = vec![0; length];
+                let mut chunk = ChunkMut {
+                    bytes: &mut bytes,
+                    size,
+                    width,
+                    begin,
+                };
+                for (piece, place) in &found {
+                    match piece {
+                        Piece::Uniform(value) => fill(*value, place, voxels, &mut chunk),
+                        Piece::Values(values) => copy(values, place, voxels, &mut chunk),
+                    }
+                }
+                bytes.into()
+            }
+        };
+        Ok(match is_zero(&bytes) {
+            true => Chunk::Empty,
+            false => Chunk::Voxels(bytes),
+        })
     }
+}
+
+/// Whether there is no other byte. Looks at many at a time.
+fn is_zero(bytes: &[u8]) -> bool {
+    let (blocks, rest) = bytes.as_chunks::<64>();
+    let any = |bytes: &[u8]| bytes.iter().fold(0, |any, byte| any | byte);
+    blocks.iter().all(|block| any(block) == 0) && any(rest) == 0
 }
 
 fn unfinished(id: ChunkId) -> ChunkError {

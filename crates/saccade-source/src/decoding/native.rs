@@ -1,24 +1,18 @@
-use std::sync::LazyLock;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use bytes::Bytes;
-use tokio::sync::Semaphore;
 
 use super::Decoding;
 use crate::codecs::Damage;
+use crate::processors::on_a_processor;
 
-/// As many decode at once as there are processors: more would only fill memory.
-static PROCESSORS: LazyLock<Semaphore> =
-    LazyLock::new(|| Semaphore::new(std::thread::available_parallelism().map_or(2, usize::from)));
-
-/// Decodes on a thread for that.
+/// Decodes on a thread for that. There are as many as processors: more would only fill memory, and each keeps what
+/// its decoders need.
 pub(crate) async fn decode(decoding: Decoding, bytes: Bytes) -> Result<Bytes, Damage> {
-    // The semaphore is never closed.
-    let permit = PROCESSORS.acquire().await.ok();
-    let done = tokio::task::spawn_blocking(move || {
-        let _permit = permit;
-        decoding.run(bytes)
-    });
-    // It panicked, or the program ends.
-    done.await
-        .unwrap_or_else(|_| Err("decoding it was interrupted".to_owned()))
+    on_a_processor(move || {
+        // Bytes that somebody else wrote end nothing but their own chunk, also where a decoder has a bug.
+        let done = catch_unwind(AssertUnwindSafe(|| decoding.run(bytes)));
+        done.unwrap_or_else(|_| Err("decoding it was interrupted".to_owned()))
+    })
+    .await
 }

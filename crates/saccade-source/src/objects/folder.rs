@@ -1,16 +1,22 @@
 use std::fs::File;
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Component, Path, PathBuf};
+use std::sync::Arc;
 
 use bytes::Bytes;
+use tokio::sync::Semaphore;
 
 use super::{ObjectError, Objects, Part, is_key};
 use crate::maybe_send::BoxFuture;
+
+/// Files that are read at once: a disk is kept busy by fewer, and each takes a thread.
+const AT_ONCE: usize = 16;
 
 /// Files below a folder. Links are followed: the folder is its owner's.
 #[derive(Clone, Debug)]
 pub struct FolderObjects {
     folder: PathBuf,
+    reads: Arc<Semaphore>,
 }
 
 impl FolderObjects {
@@ -18,6 +24,7 @@ impl FolderObjects {
     pub fn new(folder: &Path) -> Self {
         Self {
             folder: folder.to_owned(),
+            reads: Arc::new(Semaphore::new(AT_ONCE)),
         }
     }
 
@@ -29,7 +36,12 @@ impl FolderObjects {
             });
         }
         let path = self.folder.join(key);
-        let read = tokio::task::spawn_blocking(move || read_part(&path, &part));
+        // The semaphore is never closed. A read that nobody waits for any more keeps its place until it ends.
+        let place = self.reads.clone().acquire_owned().await.ok();
+        let read = tokio::task::spawn_blocking(move || {
+            let _place = place;
+            read_part(&path, &part)
+        });
         match read.await {
             Ok(read) => read,
             Err(ended) => Err(ObjectError::Io {

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
-use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -14,7 +13,6 @@ use glam::DVec2;
 use saccade_core::levels::Level;
 use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
-use tokio::sync::oneshot;
 
 use super::along_z::{AlongZ, Gaps, Sections, between};
 use super::block::{Block, BlockGrid, Failure, Slice};
@@ -26,6 +24,7 @@ use super::resample::{Interpolation, Sample};
 use super::tiles::{Image, Tiles};
 use super::{StitchedOptions, StitchedStatistics};
 use crate::ValueRange;
+use crate::processors::on_a_processor;
 
 /// Samples per axis that a voxel larger than any pixel is made of, at most: 2^4.
 const FINEST_SAMPLING: u32 = 4;
@@ -223,7 +222,7 @@ impl Builder {
         self.blocks.fetch_add(1, Ordering::Relaxed);
         self.voxels.fetch_add(voxels.voxels(), Ordering::Relaxed);
         let (chunk, try_again) = (grid.chunk(), self.try_again);
-        let block = on_rayon(move || Block::cut(voxels, chunk, &slices, try_again)).await;
+        let block = on_a_processor(move || Block::cut(voxels, chunk, &slices, try_again)).await;
         Ok(block)
     }
 
@@ -379,7 +378,7 @@ impl Builder {
         let below = self.first_of::<S>(place, below, plan);
         let above = self.first_of::<S>(place, above, plan);
         let (mut below, above) = try_join(below, above).await?;
-        let mixed = on_rayon(move || {
+        let mixed = on_a_processor(move || {
             below.values = match (below.values, above.values) {
                 (Some(mut below), Some(above)) => {
                     between(&mut below, &above, part);
@@ -420,7 +419,7 @@ impl Builder {
                 // Coarse levels span many sections, of which the first hides nearly all: only what
                 // may still be seen is opened.
                 Some((grid, uncovered)) => {
-                    let seen = on_rayon(move || {
+                    let seen = on_a_processor(move || {
                         near.retain(|tile| uncovered.touches(&grid, tile));
                         (near, uncovered)
                     });
@@ -447,7 +446,8 @@ impl Builder {
                     }
                 }
             }
-            let covered = on_rayon(move || cover(&grid, rules.overlaps, uncovered, candidates));
+            let covered =
+                on_a_processor(move || cover(&grid, rules.overlaps, uncovered, candidates));
             let (uncovered, new_parts) = covered.await;
             parts.extend(new_parts);
             let done = uncovered.is_empty();
@@ -476,7 +476,7 @@ impl Builder {
         });
         let fetched = join_all(fetched).await;
         let tiles = self.tiles.clone();
-        let sampled = on_rayon(move || {
+        let sampled = on_a_processor(move || {
             let by = grid.size.x / size.x;
             let mut canvas = Canvas::<S>::new(grid, by, rules);
             for (part, fetched) in fetched {
@@ -530,23 +530,4 @@ fn cover(
         segments,
     });
     (uncovered, parts.collect())
-}
-
-/// Runs on rayon's threads, unless nobody waits for it any more.
-async fn on_rayon<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
-    let (send, receive) = oneshot::channel();
-    rayon::spawn(move || {
-        if !send.is_closed() {
-            // A panic is a bug; it goes to whoever waits, instead of ending the process.
-            let done = catch_unwind(AssertUnwindSafe(work));
-            let _ = send.send(done);
-        }
-    });
-    match receive
-        .await
-        .expect("the sender sends while the receiver is there")
-    {
-        Ok(done) => done,
-        Err(panic) => resume_unwind(panic),
-    }
 }
