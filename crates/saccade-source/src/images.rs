@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::VolumeSource;
-use crate::objects::{Location, LocationError};
+use crate::objects::{Location, LocationError, Objects, Part};
 use crate::precomputed::{PrecomputedError, PrecomputedSource};
 use crate::zarr::{ZarrError, ZarrSource};
 
@@ -38,6 +38,14 @@ pub enum ImageError {
         /// Folder or address.
         location: String,
     },
+    /// Something else is there.
+    #[error("this is {what}: {location}")]
+    Other {
+        /// What it is, and what to do about it.
+        what: &'static str,
+        /// Folder or address.
+        location: String,
+    },
     /// There is no image of a format that is known.
     #[error(
         "there is no image that can be opened: neither OME-Zarr (zarr.json, .zattrs) nor precomputed (info): {location}"
@@ -48,11 +56,45 @@ pub enum ImageError {
     },
 }
 
+/// What else there may be, by an object that it has.
+const OTHERS: [(&str, &str); 4] = [
+    (
+        "attributes.json",
+        "N5, which is not read; convert it to OME-Zarr",
+    ),
+    (
+        ".zarray",
+        "a Zarr array by itself; name the image (multiscales) that it is a level of",
+    ),
+    (
+        ".zgroup",
+        "a Zarr group without an image (multiscales); name the image in it",
+    ),
+    (
+        "manifest.ocdbt",
+        "an OCDBT database, which is not read; copy its content into files",
+    ),
+];
+/// Longest object that is looked at for that \[bytes\].
+const MOST: u64 = 16 << 20;
+
+async fn other(objects: &dyn Objects) -> Option<&'static str> {
+    for (key, what) in OTHERS {
+        let part = Part::Whole { most: MOST };
+        // Whatever fails here says nothing.
+        if let Ok(Some(_)) = objects.read(key, part).await {
+            return Some(what);
+        }
+    }
+    None
+}
+
 /// Opens the image at a place. Nothing else is asked but the place.
 ///
 /// # Errors
 ///
-/// [`ImageError::None`] if there is none, [`ImageError::Denied`] if nothing may be read there, others if there is one that cannot be opened.
+/// [`ImageError::None`] if there is none, [`ImageError::Other`] if there is something else, [`ImageError::Denied`] if nothing may be
+/// read there, others if there is one that cannot be opened.
 pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
     let (objects, name) = (location.objects()?, location.name());
     match ZarrSource::open(objects.clone(), &name).await {
@@ -72,11 +114,39 @@ pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
         }
         Err(PrecomputedError::NoVolume { .. }) => {
             let location = location.to_string();
-            Err(match objects.denied() {
-                Some(advice) => ImageError::Denied { advice, location },
+            if let Some(advice) = objects.denied() {
+                return Err(ImageError::Denied { advice, location });
+            }
+            Err(match other(&*objects).await {
+                Some(what) => ImageError::Other { what, location },
                 None => ImageError::None { location },
             })
         }
         Err(error) => Err(error.into()),
+    }
+}
+
+#[cfg(all(test, not(target_family = "wasm")))]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn what_else_there_is_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let refused = async || {
+            let location = Location::Folder(folder.path().to_owned());
+            open(&location).await.err().unwrap().to_string()
+        };
+        assert!(refused().await.contains("neither OME-Zarr"));
+        for (name, words) in [
+            (".zgroup", "Zarr group without"),
+            (".zarray", "array by itself"),
+            ("attributes.json", "is N5"),
+        ] {
+            std::fs::write(folder.path().join(name), "{}").unwrap();
+            let refused = refused().await;
+            assert!(refused.contains(words), "{refused}");
+            std::fs::remove_file(folder.path().join(name)).unwrap();
+        }
     }
 }

@@ -120,9 +120,10 @@ impl FromStr for Place {
     }
 }
 
-/// Whether an image that somebody else wrote is in a folder.
+/// Whether an image that somebody else wrote is in a folder, or what they know as one (N5), which is refused by name.
 fn is_image(folder: &Path) -> bool {
-    ZarrSource::is_zarr(folder) || folder.join("info").is_file()
+    let has = |name: &str| folder.join(name).is_file();
+    ZarrSource::is_zarr(folder) || has("info") || has("attributes.json")
 }
 
 /// Opens an image, and tells what its user should know.
