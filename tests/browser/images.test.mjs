@@ -86,6 +86,28 @@ test('an image is shown in the colours and the window that it asks for', async (
   await page.context().close();
 });
 
+test('all that an address asks for is shown, and what is outside of the volume is told', async () => {
+  const { page } = await open(browser, SIZE);
+  const asked = [['slice', 'z=25'], ['slab', '400'], ['cut', 'x=20'], ['cut', '0,-1,0@0,60,0'], ['detail', '1']];
+  const url = new URL(address('em.zarr'));
+  for (const [name, value] of asked) url.searchParams.append(name, value);
+  await page.goto(url.href);
+  await settled(page);
+  const want = await render(CAMERA, TRANSFER, ...asked.flatMap(([name, value]) => [`--${name}`, value]));
+  const shown = await picture(await page.screenshot());
+  const agreement = psnr(shown, want);
+  assert.ok(agreement >= AGREE_DB, `the pictures agree to ${agreement} dB only`);
+  for (const left of ['slab', 'cut', 'detail']) {
+    const others = asked.filter(([name]) => name !== left);
+    const control = psnr(shown, await render(CAMERA, TRANSFER, ...others.flatMap(([name, value]) => [`--${name}`, value])));
+    assert.ok(control < AGREE_DB - 5, `without ${left} the picture is the same: ${control} dB`);
+  }
+  url.searchParams.set('slice', 'z=9999');
+  await page.goto(url.href);
+  assert.match(await message(page), /z=9999 is outside the volume, in which z goes from 0 to 50/);
+  await page.context().close();
+});
+
 test('a server that knows no ranges is slow, not wrong', async () => {
   images.rules.ranges = false;
   const { page } = await show('sharded.zarr');
@@ -204,9 +226,9 @@ async function settled(page, fidelity = 'complete') {
   }, 120);
 }
 
-async function render(camera, transfer = TRANSFER) {
+async function render(camera, transfer = TRANSFER, ...more) {
   const out = join(work.path, 'render.png');
   await run('render', join(work.path, 'em.zarr'), '--camera', camera, '--transfer', transfer,
-    '--size', `${SIZE.width}x${SIZE.height}`, '-o', out);
+    '--size', `${SIZE.width}x${SIZE.height}`, ...more, '-o', out);
   return picture(out);
 }

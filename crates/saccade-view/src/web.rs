@@ -81,6 +81,8 @@ async fn run(canvas_id: &str) -> Result<(), String> {
         Some(image) => open_image(&image).await?,
         None => open_volume(&origin, page.volume).await?,
     };
+    let seen = page.view.shown.check(opened.source.volume());
+    seen.map_err(|error| format!("The page's address asks for what is not there: {error}."))?;
 
     let options = eframe::WebOptions {
         wgpu_options: wgpu_options(),
@@ -167,21 +169,12 @@ fn page_options(search: &str) -> Result<PageOptions, String> {
     let query = search.trim_start_matches('?');
     let parameters =
         web_sys::UrlSearchParams::new_with_str(query).map_err(|error| format!("{error:?}"))?;
-    let names = [
-        "volume",
-        "source",
-        "camera",
-        "channels",
-        "transfer",
-        "mode",
-        "clip",
-        "slice",
-        "background",
-        "ui",
-    ];
-    let pairs = names
-        .iter()
-        .filter_map(|name| Some(((*name).to_owned(), parameters.get(name)?)));
+    // Each is an array of a name and a value; some names come several times.
+    let pairs = js_sys::try_iter(&parameters).ok().flatten();
+    let pairs = { pairs.into_iter().flatten() }.filter_map(|pair| {
+        let pair = js_sys::Array::from(&pair.ok()?);
+        Some((pair.get(0).as_string()?, pair.get(1).as_string()?))
+    });
     PageOptions::from_pairs(pairs).map_err(|error| in_words(&error))
 }
 
