@@ -2,7 +2,9 @@
 
 mod accept;
 mod access;
+mod connection;
 mod connections;
+mod heads;
 mod limits;
 mod paced;
 
@@ -89,6 +91,12 @@ pub enum ServeError {
         /// As asked for.
         address: SocketAddr,
     },
+    /// The system gives no thread or no timer to accept connections by; see the source.
+    #[error("connections cannot be accepted")]
+    Accept {
+        /// What the system says.
+        source: io::Error,
+    },
 }
 
 /// Listens already; answers while it runs.
@@ -132,7 +140,7 @@ impl Server {
     ///
     /// # Errors
     ///
-    /// None at present: what happens to one connection ends no others.
+    /// [`ServeError::Accept`] before anything is answered. What happens to one connection ends no others.
     pub async fn run(
         self,
         volumes: Volumes,
@@ -149,7 +157,9 @@ impl Server {
             std::future::pending::<()>().await;
         };
         tokio::select! {
-            () = accept::accept(self.listener, router(app), limits, closing) => Ok(()),
+            ended = accept::accept(self.listener, router(app), limits, closing) => {
+                ended.map_err(|source| ServeError::Accept { source })
+            }
             () = stopping => Ok(()),
         }
     }

@@ -1,82 +1,192 @@
-//! The accept loop, and what a connection goes through.
+//! The accept loop, and the room where connections wait for their requests.
 
-use std::convert::Infallible;
+use std::cell::Cell;
+use std::io;
 use std::net::SocketAddr;
-use std::pin::{Pin, pin};
+use std::panic::resume_unwind;
+use std::pin::pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
+use std::thread;
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::{Body, Bytes, HttpBody};
-use axum::extract::ConnectInfo;
-use axum::http::Request;
-use axum::response::Response;
-use hyper::body::{Frame, Incoming, SizeHint};
-use hyper::server::conn::http1;
-use hyper::service::{Service, service_fn};
-use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::watch;
+use tokio::runtime::{Builder, Handle};
+use tokio::sync::{oneshot, watch};
 use tokio::task::JoinSet;
 
-use super::connections::{Answering, Connection, Connections};
+use super::connection::{Next, begin};
+use super::connections::Connections;
 use super::limits::Limits;
-use super::paced::Paced;
 
 /// How long answers under way may take once the server is to stop.
 const LAST_ANSWERS: Duration = Duration::from_secs(2);
-/// Longest head of a request \[bytes\].
-const HEAD_BYTES: usize = 32 * 1024;
 /// Until the next attempt, where the system has no more connections to give.
 const OUT_OF_FILES: Duration = Duration::from_millis(20);
 /// What a client reads for whom there is no place.
 const FULL: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nConnection: close\r\n\
     Access-Control-Allow-Origin: *\r\nContent-Length: 0\r\n\r\n";
+/// How much less of a processor the room gets than who answers, where both want it: a tenth (Linux's `nice`).
+#[cfg(target_os = "linux")]
+const NICE: i32 = 10;
+/// How long parts of requests wait for others, so that the room is entered for many at once.
+const NAP: Duration = Duration::from_millis(1);
+
+thread_local! {
+    /// Parts of requests that came since the room last had nothing to do.
+    static PARTS: Cell<u32> = const { Cell::new(0) };
+}
 
 /// Accepts connections until `closing` turns true; then finishes the answers under way.
+///
+/// Connections wait in a thread of their own, and are answered where this is called.
+///
+/// # Errors
+///
+/// If the system gives no such thread.
 pub(super) async fn accept(
     listener: TcpListener,
     router: Router,
     limits: Limits,
-    mut closing: watch::Receiver<bool>,
-) {
-    let limits = limits.within_open_files();
-    let connections = Connections::new(limits.connections);
-    let service = TowerToHyperService::new(router);
-    let mut tasks = JoinSet::new();
-    let mut closed = pin!(closed(closing.clone()));
-    loop {
-        let accepted = tokio::select! {
-            () = &mut closed => break,
-            accepted = listener.accept() => accepted,
-            Some(_) = tasks.join_next() => continue,
-        };
-        match accepted {
-            Ok((stream, peer)) => match connections.admit() {
-                Some(connection) => {
-                    let service = service.clone();
-                    let closed = self::closed(closing.clone());
-                    tasks.spawn(serve(stream, peer, service, limits, connection, closed));
+    closing: watch::Receiver<bool>,
+) -> io::Result<()> {
+    let room = Room {
+        service: TowerToHyperService::new(router),
+        limits: limits.within_open_files(),
+        closing,
+        answering: Handle::current(),
+    };
+    let listener = listener.into_std()?;
+    let runtime = Builder::new_current_thread()
+        .enable_all()
+        .on_thread_park(nap)
+        .build()?;
+    let (end, ended) = oneshot::channel();
+    let thread = thread::Builder::new().name("saccade-accept".to_owned());
+    let thread = thread.spawn(move || {
+        give_way();
+        let kept = runtime.block_on(room.keep(listener));
+        // Nobody waits where the server was dropped.
+        let _ = end.send(kept);
+    })?;
+    match ended.await {
+        Ok(kept) => kept,
+        Err(_) => match thread.join() {
+            Err(panic) => resume_unwind(panic),
+            Ok(()) => Ok(()),
+        },
+    }
+}
+
+/// Lets those go first who answer.
+fn give_way() {
+    // Elsewhere than on Linux that would be the whole program.
+    #[cfg(target_os = "linux")]
+    if let Err(error) = rustix::process::setpriority_process(None, NICE) {
+        log::debug!("connections are accepted at full priority: {error}");
+    }
+}
+
+/// Before the room waits for more. A request that comes whole is never kept waiting by this alone.
+fn nap() {
+    if PARTS.take() > 0 {
+        thread::sleep(NAP);
+    }
+}
+
+struct Room {
+    service: TowerToHyperService<Router>,
+    limits: Limits,
+    closing: watch::Receiver<bool>,
+    /// Where requests are answered.
+    answering: Handle,
+}
+
+impl Room {
+    async fn keep(self, listener: std::net::TcpListener) -> io::Result<()> {
+        let listener = TcpListener::from_std(listener)?;
+        let connections = Connections::new(self.limits.connections);
+        // Of all connections, wherever they are taken care of.
+        let mut tasks = JoinSet::new();
+        let mut closed = pin!(closed(self.closing.clone()));
+        loop {
+            let accepted = tokio::select! {
+                () = &mut closed => break,
+                accepted = listener.accept() => accepted,
+                Some(next) = tasks.join_next() => {
+                    // One that panicked is gone.
+                    self.go_on(next.unwrap_or(Next::Nothing), &mut tasks);
+                    continue;
                 }
-                // Its buffer is empty: this takes no time. A client that is gone does not matter.
-                None => drop(stream.try_write(FULL)),
-            },
-            Err(error) if is_the_client_s(&error) => {}
-            Err(error) => {
-                log::warn!("no connection can be accepted: {error}");
-                connections.evict();
-                tokio::time::sleep(OUT_OF_FILES).await;
+            };
+            match accepted {
+                Ok((stream, peer)) => self.admit(stream, peer, &connections, &mut tasks),
+                Err(error) if is_the_client_s(&error) => {}
+                Err(error) => {
+                    log::warn!("no connection can be accepted: {error}");
+                    connections.evict();
+                    tokio::time::sleep(OUT_OF_FILES).await;
+                }
+            }
+        }
+        drop(listener);
+        // Who has not asked wholly is not answered any more.
+        let finished = async { while tasks.join_next().await.is_some() {} };
+        // Whoever is not done by then is cut off.
+        drop(tokio::time::timeout(LAST_ANSWERS, finished).await);
+        Ok(())
+    }
+
+    fn admit(
+        &self,
+        stream: TcpStream,
+        peer: SocketAddr,
+        connections: &Arc<Connections>,
+        tasks: &mut JoinSet<Next>,
+    ) {
+        match connections.admit() {
+            Some(place) => {
+                let began = begin(stream, peer, place, self.limits, came);
+                tasks.spawn(self.unless_closed(began));
+            }
+            // Its buffer is empty: this takes no time. A client that is gone does not matter.
+            None => drop(stream.try_write(FULL)),
+        }
+    }
+
+    fn go_on(&self, next: Next, tasks: &mut JoinSet<Next>) {
+        match next {
+            Next::Answer(connection) => {
+                let closed = closed(self.closing.clone());
+                let answers = connection.answer(self.service.clone(), self.limits, closed);
+                tasks.spawn_on(answers, &self.answering);
+            }
+            Next::Wait(connection) => {
+                tasks.spawn(self.unless_closed(connection.wait(came)));
+            }
+            Next::Nothing => {}
+        }
+    }
+
+    /// What is waited for, unless the server stops.
+    fn unless_closed(
+        &self,
+        next: impl Future<Output = Next> + Send + 'static,
+    ) -> impl Future<Output = Next> + Send + 'static {
+        let closed = closed(self.closing.clone());
+        async {
+            tokio::select! {
+                next = next => next,
+                () = closed => Next::Nothing,
             }
         }
     }
-    drop(listener);
-    // Marks the news as seen: every connection has its own receiver.
-    closing.mark_unchanged();
-    let finished = async { while tasks.join_next().await.is_some() {} };
-    // Whoever is not done by then is cut off.
-    drop(tokio::time::timeout(LAST_ANSWERS, finished).await);
+}
+
+/// Only a part of a request came.
+fn came() {
+    PARTS.set(PARTS.get().saturating_add(1));
 }
 
 /// Done when the server is to stop, or is gone.
@@ -85,89 +195,10 @@ async fn closed(mut closing: watch::Receiver<bool>) {
 }
 
 /// It went away before it was accepted.
-fn is_the_client_s(error: &std::io::Error) -> bool {
-    use std::io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
+fn is_the_client_s(error: &io::Error) -> bool {
+    use io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
     matches!(
         error.kind(),
         ConnectionAborted | ConnectionRefused | ConnectionReset
     )
-}
-
-async fn serve(
-    stream: TcpStream,
-    peer: SocketAddr,
-    service: TowerToHyperService<Router>,
-    limits: Limits,
-    connection: Arc<Connection>,
-    closed: impl Future<Output = ()>,
-) {
-    // Chunks are many and small: waiting to fill packets would only delay them.
-    if let Err(error) = stream.set_nodelay(true) {
-        log::debug!("cannot turn off packet delay: {error}");
-    }
-    let answer = {
-        let connection = connection.clone();
-        service_fn(move |mut request: Request<Incoming>| {
-            let answering = connection.answering();
-            request.extensions_mut().insert(ConnectInfo(peer));
-            let response = service.call(request);
-            async move {
-                let response: Response = response.await?;
-                Ok::<_, Infallible>(response.map(|body| Answer {
-                    body,
-                    _answering: answering,
-                }))
-            }
-        })
-    };
-    let mut serving = pin!(
-        http1::Builder::new()
-            .timer(TokioTimer::new())
-            .header_read_timeout(limits.head)
-            .max_header_size(HEAD_BYTES)
-            .max_buf_size(2 * HEAD_BYTES)
-            .serve_connection(TokioIo::new(Paced::new(stream, limits.pace)), answer)
-    );
-    let mut evicted = pin!(connection.evicted());
-    tokio::select! {
-        ended = &mut serving => return said(peer, ended),
-        () = &mut evicted => return,
-        () = closed => serving.as_mut().graceful_shutdown(),
-    }
-    tokio::select! {
-        ended = serving => said(peer, ended),
-        () = evicted => {}
-    }
-}
-
-fn said(peer: SocketAddr, ended: hyper::Result<()>) {
-    if let Err(error) = ended {
-        log::debug!("{peer}: {error}");
-    }
-}
-
-/// A body that keeps its connection's place until it is sent.
-struct Answer {
-    body: Body,
-    _answering: Answering,
-}
-
-impl HttpBody for Answer {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(cx)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
 }

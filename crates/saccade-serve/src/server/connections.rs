@@ -18,12 +18,12 @@ struct State {
     /// Counts what happens: later is more.
     now: u64,
     /// Those that are not being answered, in the order in which they go.
-    waiting: BTreeMap<Place, Arc<Notify>>,
+    waiting: BTreeMap<Turn, Arc<Notify>>,
 }
 
-/// Where a connection stands in the order of leaving.
+/// When a connection has to leave, beside others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Place {
+struct Turn {
     /// Whether it was ever answered: who never asked anything goes first.
     known: bool,
     since: u64,
@@ -38,19 +38,19 @@ impl Connections {
     }
 
     /// One more connection, perhaps in place of another. `None` where all are being answered.
-    pub(super) fn admit(self: &Arc<Self>) -> Option<Arc<Connection>> {
+    pub(super) fn admit(self: &Arc<Self>) -> Option<Arc<Place>> {
         let mut state = self.state();
         if state.open >= self.most && !state.evict() {
             return None;
         }
         state.open += 1;
         let evicted = Arc::new(Notify::new());
-        let place = state.wait(false, evicted.clone());
+        let turn = state.wait(false, evicted.clone());
         drop(state);
-        Some(Arc::new(Connection {
+        Some(Arc::new(Place {
             all: self.clone(),
             evicted,
-            place: Mutex::new(Some(place)),
+            turn: Mutex::new(Some(turn)),
         }))
     }
 
@@ -74,31 +74,31 @@ impl State {
         true
     }
 
-    fn wait(&mut self, known: bool, evicted: Arc<Notify>) -> Place {
+    fn wait(&mut self, known: bool, evicted: Arc<Notify>) -> Turn {
         let since = self.now;
         self.now += 1;
-        let place = Place { known, since };
-        self.waiting.insert(place, evicted);
-        place
+        let turn = Turn { known, since };
+        self.waiting.insert(turn, evicted);
+        turn
     }
 }
 
-/// One connection, until it is dropped.
+/// The place of one connection, until it is dropped.
 #[derive(Debug)]
-pub(super) struct Connection {
+pub(super) struct Place {
     all: Arc<Connections>,
     evicted: Arc<Notify>,
     /// `None` while it is being answered.
-    place: Mutex<Option<Place>>,
+    turn: Mutex<Option<Turn>>,
 }
 
-impl Connection {
+impl Place {
     /// Keeps its place until the answer is dropped.
     pub(super) fn answering(self: &Arc<Self>) -> Answering {
         let mut state = self.all.state();
-        let mut own = lock(&self.place);
+        let mut own = lock(&self.turn);
         // One that had to go a moment ago is in no place any more, and the news is on its way.
-        if own.is_some_and(|place| state.waiting.remove(&place).is_some()) {
+        if own.is_some_and(|turn| state.waiting.remove(&turn).is_some()) {
             *own = None;
         }
         drop(own);
@@ -111,11 +111,11 @@ impl Connection {
     }
 }
 
-impl Drop for Connection {
+impl Drop for Place {
     fn drop(&mut self) {
         let mut state = self.all.state();
-        let was_waiting = lock(&self.place).take();
-        let evicted = was_waiting.is_some_and(|place| state.waiting.remove(&place).is_none());
+        let was_waiting = lock(&self.turn).take();
+        let evicted = was_waiting.is_some_and(|turn| state.waiting.remove(&turn).is_none());
         if !evicted {
             state.open -= 1;
         }
@@ -124,19 +124,15 @@ impl Drop for Connection {
 
 /// An answer under way.
 #[derive(Debug)]
-pub(super) struct Answering(Arc<Connection>);
+pub(super) struct Answering(Arc<Place>);
 
 impl Drop for Answering {
     fn drop(&mut self) {
-        let Connection {
-            all,
-            evicted,
-            place,
-        } = &*self.0;
+        let Place { all, evicted, turn } = &*self.0;
         let mut state = all.state();
-        let mut place = lock(place);
-        if place.is_none() {
-            *place = Some(state.wait(true, evicted.clone()));
+        let mut turn = lock(turn);
+        if turn.is_none() {
+            *turn = Some(state.wait(true, evicted.clone()));
         }
     }
 }
@@ -151,7 +147,7 @@ mod tests {
     use super::*;
     use futures::FutureExt;
 
-    fn gone(connection: &Connection) -> bool {
+    fn gone(connection: &Place) -> bool {
         connection.evicted().now_or_never().is_some()
     }
 
@@ -180,7 +176,7 @@ mod tests {
     fn those_being_answered_stay() {
         let all = Connections::new(2);
         let kept = [(); 2].map(|()| all.admit().unwrap());
-        let answers = kept.each_ref().map(Connection::answering);
+        let answers = kept.each_ref().map(Place::answering);
         assert!(all.admit().is_none());
         drop(answers);
         assert!(all.admit().is_some());

@@ -37,6 +37,11 @@ impl<S> Paced<S> {
         }
     }
 
+    /// The stream.
+    pub(super) fn into_inner(self) -> S {
+        self.stream
+    }
+
     /// What becomes of an attempt to write.
     fn paced(
         &mut self,

@@ -76,6 +76,93 @@ fn a_head_that_drips_in_is_not_waited_for() {
     });
 }
 
+/// Also after a request that was whole, and in between answers that are under way.
+#[test]
+fn a_next_head_that_drips_in_is_not_waited_for_either() {
+    run(async {
+        let head = SHORT;
+        let served = serve(limited(Limits {
+            head,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let whole = request(CHUNK_PATH);
+        let (begun, rest_of_it) = whole.split_at(10);
+        for pause in [SHORT / 30, 2 * SHORT] {
+            let mut stream = connect(&served.url).await;
+            // One and the beginning of the next together, then the rest of that.
+            let both = format!("{whole}{begun}");
+            stream.write_all(both.as_bytes()).await.unwrap();
+            sleep(pause).await;
+            // Where it was too late, the connection has ended.
+            drop(stream.write_all(rest_of_it.as_bytes()).await);
+            let last = whole.replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n");
+            drop(stream.write_all(last.as_bytes()).await);
+            let answers = rest(&mut stream).await.matches("HTTP/1.1 200").count();
+            assert_eq!(answers, if pause < head { 3 } else { 1 }, "{pause:?}");
+        }
+        assert!(is_well(&served).await);
+    });
+}
+
+#[test]
+fn what_is_no_request_is_refused_at_once() {
+    run(async {
+        let served = serve(Options::DEFAULT).await;
+        for nonsense in [&b"\x16\x03\x01\x02\x00\x01"[..], b"hello\r\n", b"GET /\r\n"] {
+            let mut stream = connect(&served.url).await;
+            stream.write_all(nonsense).await.unwrap();
+            let answer = timeout(Duration::from_secs(5), rest(&mut stream)).await;
+            let answer = answer.expect("more of it is waited for");
+            assert!(answer.starts_with("HTTP/1.1 400"), "{nonsense:?}: {answer}");
+        }
+        let mut stream = connect(&served.url).await;
+        let long = format!("GET / HTTP/1.1\r\nX: {}", "y".repeat(40_000));
+        drop(stream.write_all(long.as_bytes()).await);
+        let answer = timeout(Duration::from_secs(5), rest(&mut stream)).await;
+        let answer = answer.expect("more of it is waited for");
+        assert!(
+            answer.is_empty() || answer.starts_with("HTTP/1.1 431"),
+            "{answer}"
+        );
+        assert!(is_well(&served).await);
+    });
+}
+
+/// Clients that send a byte now and then take a place each, and nothing else.
+#[test]
+fn dripping_clients_do_not_keep_others_from_being_answered() {
+    run(async {
+        let served = serve(Options::DEFAULT).await;
+        let mut slow = Vec::new();
+        for n in 0..100 {
+            let mut stream = connect(&served.url).await;
+            // Half of them asked for something before.
+            if n % 2 == 0 {
+                stream
+                    .write_all(request("volumes.json").as_bytes())
+                    .await
+                    .unwrap();
+            }
+            stream.write_all(b"GET / HTTP/1.1\r\nX: ").await.unwrap();
+            slow.push(stream);
+        }
+        for _ in 0..20 {
+            for stream in &mut slow {
+                stream.write_all(b"z").await.unwrap();
+            }
+            assert!(is_well(&served).await);
+        }
+        // They were waited for: each gets its answer.
+        for (n, stream) in slow.iter_mut().enumerate() {
+            let end = b"\r\nHost: localhost\r\nConnection: close\r\n\r\n";
+            stream.write_all(end).await.unwrap();
+            let answers = rest(stream).await.matches("HTTP/1.1 200").count();
+            assert_eq!(answers, if n % 2 == 0 { 2 } else { 1 }, "client {n}");
+        }
+    });
+}
+
 #[test]
 fn connections_that_do_nothing_end() {
     run(async {
