@@ -1,5 +1,7 @@
 //! The same voxels in every format, and addresses that name a version.
 
+use std::time::Duration;
+
 use glam::UVec3;
 use reqwest::StatusCode;
 use reqwest::header::{ORIGIN, RANGE};
@@ -9,7 +11,8 @@ use saccade_serve::Options;
 use saccade_source::VolumeSource;
 use serde_json::json;
 
-use super::{CHUNK, EXTENT, Served, header, run, serve, value};
+use super::server::never;
+use super::{CHUNK, EXTENT, Served, header, run, serve, serve_source, value};
 
 /// What a format calls a chunk of a level, and the box of it that the object holds.
 type Named = fn(&Served, usize, UVec3) -> (String, VoxelBox);
@@ -117,11 +120,57 @@ fn every_format_answers_as_the_standard_says() {
             let part = part.send().await.unwrap();
             assert_eq!(part.status(), StatusCode::PARTIAL_CONTENT);
             assert_eq!(part.bytes().await.unwrap().len(), 5);
-            let held = ask(Method::GET).header("if-none-match", &tag).send();
-            assert_eq!(held.await.unwrap().status(), StatusCode::NOT_MODIFIED);
+            for (name, value, status) in [
+                ("if-none-match", &*tag, StatusCode::NOT_MODIFIED),
+                ("if-match", &*tag, StatusCode::OK),
+                ("if-match", "\"other\"", StatusCode::PRECONDITION_FAILED),
+                (
+                    "range",
+                    "bytes=99999999-",
+                    StatusCode::RANGE_NOT_SATISFIABLE,
+                ),
+            ] {
+                let answer = ask(Method::GET).header(name, value).send().await.unwrap();
+                assert_eq!(answer.status(), status, "{key}: {name}: {value}");
+                let read_by = header(answer.headers(), "access-control-allow-origin");
+                assert_eq!(read_by, Some("*"), "{key}: {name}: {value}");
+            }
             let (nothing, _) = named(&served, 0, UVec3::ZERO);
-            let nothing = served.get(&format!("v/em/{nothing}")).await;
-            assert_eq!(nothing.status(), StatusCode::NOT_FOUND);
+            for method in [Method::GET, Method::HEAD] {
+                let nothing = served
+                    .request(method, &format!("v/em/{nothing}"))
+                    .header(ORIGIN, "http://else.where");
+                let nothing = nothing.send().await.unwrap();
+                assert_eq!(nothing.status(), StatusCode::NOT_FOUND);
+                let headers = nothing.headers();
+                assert_eq!(header(headers, "access-control-allow-origin"), Some("*"));
+                assert_eq!(header(headers, "cache-control"), Some("no-store"));
+            }
+        }
+    });
+}
+
+/// Chunks that take too long, in every format.
+#[test]
+fn every_format_says_when_to_ask_again() {
+    run(async {
+        let options = Options {
+            patience: Duration::from_millis(20),
+            ..Options::DEFAULT
+        };
+        let served = serve(Options::DEFAULT).await;
+        let (url, _stop, _) = serve_source(never(), options).await;
+        for named in FORMATS {
+            let (key, _) = named(&served, 0, UVec3::ONE);
+            let late = served.client.get(format!("{url}v/em/{key}"));
+            let late = late.header(ORIGIN, "http://else.where");
+            let late = late.send().await.unwrap();
+            assert_eq!(late.status(), StatusCode::SERVICE_UNAVAILABLE, "{key}");
+            let headers = late.headers();
+            assert_eq!(header(headers, "retry-after"), Some("1"), "{key}");
+            assert_eq!(header(headers, "access-control-allow-origin"), Some("*"));
+            let exposed = header(headers, "access-control-expose-headers").unwrap();
+            assert!(exposed.contains("retry-after"), "{exposed}");
         }
     });
 }
