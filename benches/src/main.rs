@@ -53,7 +53,7 @@ struct Arguments {
 }
 
 fn main() -> Result<()> {
-    if let Some(done) = rows::worker() {
+    if let Some(done) = rows::worker().or_else(rows::attack) {
         return done;
     }
     let arguments = Arguments::parse();

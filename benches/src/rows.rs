@@ -1,5 +1,6 @@
 //! The rows, in groups that are measured together.
 
+mod attackers;
 mod codec;
 mod construct;
 mod first_light;
@@ -148,6 +149,7 @@ pub(crate) static GROUPS: &[Group] = &[
     },
 ];
 
+pub(crate) use attackers::attack;
 pub(crate) use workers::worker;
 
 /// A Tokio runtime as the command line uses it.

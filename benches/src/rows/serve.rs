@@ -1,14 +1,11 @@
 //! The server under load: beside nginx, and among clients that mean no good.
 
 use std::fs;
-use std::io::Write as _;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, mpsc};
-use std::thread::JoinHandle;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
@@ -28,6 +25,7 @@ use tokio::runtime::Runtime;
 use crate::clock::Stopwatch;
 use crate::memory;
 use crate::report::Row;
+use crate::rows::attackers::{Attackers, BYTE, Priority};
 use crate::rows::runtime;
 use crate::scene::{Mosaic, NAME};
 use crate::settings::Settings;
@@ -51,8 +49,6 @@ const RUNS: usize = 3;
 
 /// Connections that send a byte now and then.
 const SLOW: usize = 10_000;
-/// Between two bytes of one of them.
-const BYTE: Duration = Duration::from_secs(1);
 /// Requests of the good client, one after the other.
 const REQUESTS: usize = 4000;
 
@@ -61,48 +57,84 @@ pub(crate) fn measure_slowloris() -> Result<Vec<Row>> {
     let client = runtime()?;
     let keys = served.keys();
     let slow = slow_sockets();
-    let ratio = |[idle, attacked]: [f64; 2]| attacked / idle;
-    let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+    let mut ours = Attacks::default();
+    let mut theirs = Attacks::default();
     // What the attack costs whoever is attacked, on this machine.
     let nginx = nginx_program().map(|program| Nginx::start(&program, &served));
     let nginx = nginx.transpose()?;
     for _ in 0..RUNS {
-        ours.push(among_slow_clients(&client, served.address, &keys, slow)?);
+        ours.measure(&client, served.address, &keys, slow)?;
         if let Some(nginx) = &nginx {
-            theirs.push(among_slow_clients(&client, nginx.address, &keys, slow)?);
+            theirs.measure(&client, nginx.address, &keys, slow)?;
         }
     }
-    let p99 = |of: usize| rounded(&ours.iter().map(|p99| p99[of] * 1e3).collect::<Vec<_>>());
-    let ratios = ours.iter().copied().map(ratio).collect();
-    let mut row = Row::new(SLOWLORIS, "of the idle p99", ratios)
+    let ms = |p99: &[f64]| rounded(&p99.iter().map(|p99| p99 * 1e3).collect::<Vec<_>>());
+    let mut row = Row::new(SLOWLORIS, "of the idle p99", ours.ratios(Priority::Last))
         .setting("slow sockets", slow)
         .setting("a byte every", "1 s each")
         .setting("requests per run", REQUESTS)
         .setting("chunk", "64 x 64 x 32, stitched before")
-        .setting("idle p99 [ms]", p99(0))
-        .setting("p99 among them [ms]", p99(1));
-    if !theirs.is_empty() {
-        let ratios: Vec<_> = theirs.into_iter().map(ratio).collect();
-        row = row.setting("nginx in our place, from files", rounded(&ratios));
+        .setting("idle p99 [ms]", ms(&ours.idle))
+        .setting("p99 among them [ms]", ms(&ours.last))
+        .setting(
+            "among attackers of equal priority",
+            rounded(&ours.ratios(Priority::Equal)),
+        );
+    if nginx.is_some() {
+        let ratios = |priority| rounded(&theirs.ratios(priority));
+        row = row
+            .setting("nginx in our place, from files", ratios(Priority::Last))
+            .setting(
+                "nginx among attackers of equal priority",
+                ratios(Priority::Equal),
+            )
+            .setting("nginx's idle p99 [ms]", ms(&theirs.idle))
+            .setting("nginx's p99 among them [ms]", ms(&theirs.last));
     }
     Ok(vec![row])
 }
 
-/// The 99th percentile of a good client's requests, alone and among slow clients \[s\].
-fn among_slow_clients(
-    client: &Runtime,
-    server: SocketAddr,
-    keys: &[String],
-    slow: usize,
-) -> Result<[f64; 2]> {
-    let idle = client.block_on(good_client(server, keys))?;
-    let attackers = Attackers::start(server, slow)?;
-    // The answers to their arrival are over.
-    client.block_on(async { tokio::time::sleep(BYTE).await });
-    let attacked = client.block_on(good_client(server, keys))?;
-    attackers.stop();
-    client.block_on(async { tokio::time::sleep(BYTE).await });
-    Ok([idle, attacked])
+/// The 99th percentiles of a good client's requests \[s\].
+#[derive(Debug, Default)]
+struct Attacks {
+    idle: Vec<f64>,
+    last: Vec<f64>,
+    equal: Vec<f64>,
+}
+
+impl Attacks {
+    /// Alone, and among slow clients of either priority.
+    fn measure(
+        &mut self,
+        client: &Runtime,
+        server: SocketAddr,
+        keys: &[String],
+        slow: usize,
+    ) -> Result<()> {
+        self.idle.push(client.block_on(good_client(server, keys))?);
+        for priority in [Priority::Last, Priority::Equal] {
+            let attackers = Attackers::start(server, slow, priority)?;
+            // The answers to their arrival are over.
+            client.block_on(async { tokio::time::sleep(BYTE).await });
+            let attacked = client.block_on(good_client(server, keys))?;
+            attackers.stop()?;
+            client.block_on(async { tokio::time::sleep(BYTE).await });
+            match priority {
+                Priority::Last => self.last.push(attacked),
+                Priority::Equal => self.equal.push(attacked),
+            }
+        }
+        Ok(())
+    }
+
+    fn ratios(&self, priority: Priority) -> Vec<f64> {
+        let attacked = match priority {
+            Priority::Last => &self.last,
+            Priority::Equal => &self.equal,
+        };
+        let pairs = attacked.iter().zip(&self.idle);
+        pairs.map(|(attacked, idle)| attacked / idle).collect()
+    }
 }
 
 /// As many as the process may have, beside what the server keeps of them.
@@ -113,62 +145,6 @@ fn slow_sockets() -> usize {
         .find_map(|l| l.strip_prefix("Max open files"));
     let files = line.and_then(|l| l.split_whitespace().next()?.parse::<usize>().ok());
     SLOW.min(files.unwrap_or(256) / 2)
-}
-
-/// Ten thousand requests that are never finished, from one thread that does nothing else: attackers would sit on
-/// other computers, and what theirs costs here is not the server's.
-struct Attackers {
-    stop: Arc<AtomicBool>,
-    thread: JoinHandle<()>,
-}
-
-impl Attackers {
-    /// Begins; returns once all have sent the beginning of a request.
-    fn start(server: SocketAddr, sockets: usize) -> Result<Self> {
-        let stop = Arc::new(AtomicBool::new(false));
-        let (all, connected) = mpsc::channel();
-        let stopping = stop.clone();
-        let thread = std::thread::spawn(move || {
-            let mut streams: Vec<_> = (0..sockets).map(|_| slow_client(server)).collect();
-            all.send(streams.iter().flatten().count()).ok();
-            let (mut next, watch) = (0, Stopwatch::start());
-            while !stopping.load(Ordering::Relaxed) {
-                let bytes = watch.elapsed().div_duration_f64(BYTE) * sockets as f64;
-                while (next as f64) < bytes {
-                    let stream = &mut streams[next % sockets];
-                    let sent = { stream.as_ref() }.is_some_and(|mut s| s.write_all(b"z").is_ok());
-                    if !sent {
-                        // The server ended it.
-                        *stream = slow_client(server);
-                    }
-                    next += 1;
-                }
-                std::thread::sleep(PAUSE);
-            }
-        });
-        let connected = connected.recv().context("the attackers are gone")?;
-        ensure!(
-            connected * 10 > sockets * 9,
-            "{connected} of {sockets} slow sockets"
-        );
-        Ok(Self { stop, thread })
-    }
-
-    fn stop(self) {
-        self.stop.store(true, Ordering::Relaxed);
-        drop(self.thread.join());
-    }
-}
-
-/// Bytes come one by one, as from many places, and not in a burst.
-const PAUSE: Duration = Duration::from_micros(100);
-
-fn slow_client(server: SocketAddr) -> Option<std::net::TcpStream> {
-    let mut stream = std::net::TcpStream::connect(server).ok()?;
-    stream.set_nonblocking(true).ok()?;
-    let head = b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow: ";
-    stream.write_all(head).ok()?;
-    Some(stream)
 }
 
 /// The 99th percentile of one client's requests \[s\].
