@@ -335,7 +335,13 @@ fn encoding_of(codecs: &[Value], rank: usize, number: Number) -> Result<Encoding
         let configuration = &codec["configuration"];
         match (name, as_bytes) {
             ("transpose", false) => {
-                let order = numbers(&configuration["order"]).unwrap_or_default();
+                let axes = 0..rank as u64;
+                let order = match &configuration["order"] {
+                    // Drafts of version 3 had names for two of them.
+                    Value::String(name) if name == "C" => axes.collect(),
+                    Value::String(name) if name == "F" => axes.rev().collect(),
+                    order => numbers(order).unwrap_or_default(),
+                };
                 let mut seen = vec![false; rank];
                 for axis in &order {
                     if let Some(seen) = usize::try_from(*axis)

@@ -237,6 +237,12 @@ fn transposed_chunks_are_read() {
             "c/0/0/0",
         ),
         ([2, 1, 0], column_major, "0/0/0"),
+        // As drafts of version 3 had it.
+        (
+            [2, 1, 0],
+            version_3(json!([{"name": "transpose", "configuration": {"order": "F"}}, bytes()])),
+            "c/0/0/0",
+        ),
     ] {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("transposed.zarr");
