@@ -29,6 +29,9 @@ pub(crate) use values::{Bins, BrickValues, Values};
 use crate::layout::SIBLINGS;
 use crate::stored_brick::StoredVoxels;
 
+/// Blocks looked at for one to forget that take about as long as a visit.
+const SEARCHED_PER_VISIT: u64 = 64;
+
 /// Blocks that wait for [`ResidencyOctree::flush`] at most, give or take one event.
 const MOST_DIRTY: usize = 4096;
 
@@ -408,6 +411,8 @@ impl ResidencyOctree {
                 }
             })
         });
+        // A search costs as much as a visit or a few.
+        self.visited += self.nodes.take_searched().div_ceil(SEARCHED_PER_VISIT);
         if let Some(children) = children {
             let below =
                 self.geometry.depth(depth + 1).shift - self.geometry.depth(brick.deepest).shift;

@@ -46,6 +46,8 @@ struct Block {
     touched: u64,
     in_use: bool,
     dirty: bool,
+    /// Nodes of it that have children, and channels of nodes that note a resident brick: none may be forgotten.
+    kept: u16,
 }
 
 /// Nodes, in blocks of eight. Block 0 holds the root and seven nodes that are never used.
@@ -65,6 +67,8 @@ pub(crate) struct Nodes {
     /// Where the search for a block to forget goes on.
     hand: u32,
     now: u64,
+    /// Blocks looked at in search of one to forget.
+    searched: u64,
 }
 
 /// The root.
@@ -87,6 +91,7 @@ impl Nodes {
             used: 0,
             hand: 0,
             now: 0,
+            searched: 0,
         };
         nodes.add(ROOT, |_| Own::NOTHING);
         nodes
@@ -153,6 +158,7 @@ impl Nodes {
             self.forget_some()?;
         }
         let block = self.add(node, own);
+        self.blocks[(node / SIBLINGS) as usize].kept += 1;
         self.set_children(node, block);
         Some(block * SIBLINGS)
     }
@@ -163,6 +169,7 @@ impl Nodes {
             touched: self.now,
             in_use: true,
             dirty: false,
+            kept: 0,
         };
         self.used += 1;
         let block = if let Some(block) = self.free.pop() {
@@ -228,6 +235,7 @@ impl Nodes {
         self.blocks[block as usize].in_use = false;
         self.free.push(block);
         self.used -= 1;
+        self.blocks[(node / SIBLINGS) as usize].kept -= 1;
         self.set_children(node, 0);
     }
 
@@ -245,18 +253,12 @@ impl Nodes {
         let count = u32::try_from(self.blocks.len()).expect("at most the capacity");
         let mut oldest = None;
         for _ in 0..SEARCH.min(count) {
+            self.searched += 1;
             self.hand = (self.hand + 1) % count;
             let block = self.blocks[self.hand as usize];
-            let first = self.hand * SIBLINGS;
-            let nodes = || first..first + SIBLINGS;
             // What was written to just now is being grown at this moment.
-            let may_go = block.in_use
-                && self.hand != 0
-                && block.touched < self.now
-                && nodes().all(|node| self.children(node).is_none())
-                && nodes().all(|node| {
-                    (0..self.channels).all(|channel| self.known(node, channel).resident == 0)
-                });
+            let may_go =
+                block.in_use && self.hand != 0 && block.touched < self.now && block.kept == 0;
             if may_go && oldest.is_none_or(|(touched, _)| block.touched < touched) {
                 oldest = Some((block.touched, block.parent));
             }
@@ -292,6 +294,9 @@ impl Nodes {
 
     pub(crate) fn set_known(&mut self, node: u32, channel: u32, known: Known) {
         let at = self.at(node, channel);
+        let block = &mut self.blocks[(node / SIBLINGS) as usize];
+        block.kept -= u16::from(self.resident[at] != 0);
+        block.kept += u16::from(known.resident != 0);
         let children = self.texels[at][NODE_CHILDREN as usize];
         let texel = texel(known.values, known.valid, children);
         if (self.texels[at], self.resident[at]) != (texel, known.resident) {
@@ -310,6 +315,27 @@ impl Nodes {
 
     fn at(&self, node: u32, channel: u32) -> usize {
         (node * self.channels + channel) as usize
+    }
+
+    /// Blocks looked at in search of one to forget, since the last call.
+    pub(crate) fn take_searched(&mut self) -> u64 {
+        std::mem::take(&mut self.searched)
+    }
+
+    /// Counts again what must not be forgotten.
+    #[cfg(test)]
+    pub(crate) fn check_kept(&self) {
+        for (block, at) in self.blocks.iter().zip((0..).step_by(SIBLINGS as usize)) {
+            let nodes = || at..at + SIBLINGS;
+            let residents = nodes().flat_map(|node| (0..self.channels).map(move |c| (node, c)));
+            let residents = residents.filter(|(node, c)| self.known(*node, *c).resident != 0);
+            let parents = nodes().filter(|node| self.children(*node).is_some());
+            let kept = residents.count() + parents.count();
+            assert!(
+                !block.in_use || kept == usize::from(block.kept),
+                "{block:?}"
+            );
+        }
     }
 
     /// All of it, as the device is to have it.

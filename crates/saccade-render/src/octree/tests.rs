@@ -431,6 +431,7 @@ impl World {
             }
         }
         self.flush();
+        self.tree.nodes.check_kept();
         let assigned = self.assigned().len();
         assert!(
             (1..=SLOTS as usize).contains(&assigned),
@@ -558,6 +559,42 @@ fn what_is_alike_is_one_node() {
     world.tree.insert(finest[7], values);
     world.tree.advance(u64::MAX / 2);
     assert!(world.tree.blocks().0 > 2);
+}
+
+/// What a tree costs that has no room for more: bricks come and go, and nothing that is noted may be forgotten.
+#[test]
+fn a_full_tree_is_as_cheap_as_one_with_room() {
+    let volume = Volume::new(
+        "v",
+        UVec3::new(4_096, 4_096, 512),
+        DVec3::new(5.0, 5.0, 40.0),
+    )
+    .unwrap();
+    let stored: Vec<u8> = (0..34 * 34 * 34_u32).map(|i| (i % 251) as u8).collect();
+    let stored = StoredVoxels::Uint8(stored.into());
+    let cost = |blocks: u32| {
+        let geometry = Geometry::new(&volume, UVec3::new(8, 8, 4));
+        let mut tree = ResidencyOctree::new(geometry, 1, blocks);
+        tree.assign(&[(0, bins())]);
+        tree.advance(u64::MAX / 2);
+        let before = tree.visited();
+        for n in 0..400 {
+            let at = UVec3::new(n % 20, n / 20, 3);
+            let id = BrickId::new(0, 0, at).unwrap();
+            let values = tree.values_of(id, &stored);
+            tree.insert(id, values);
+            tree.advance(u64::MAX / 2);
+        }
+        ((tree.visited() - before) / 400, tree.blocks())
+    };
+    let (roomy, (used, _)) = cost(1 << 18);
+    let (full, (all, most)) = cost(512);
+    assert!(used > 4 * 512, "{used} blocks are not many");
+    assert_eq!(all, most, "the tree is not even full");
+    assert!(
+        full <= 2 * roomy,
+        "{full} visits a brick instead of {roomy}"
+    );
 }
 
 /// Work per brick does not depend on the size of the volume but through the depth of the tree.
