@@ -318,12 +318,14 @@ proptest! {
     }
 }
 
+/// A million operations, a third of them on each of three shapes.
 #[test]
 fn holds_for_a_long_time() {
+    const ROUNDS: u32 = 1_000_000_u32.div_ceil(3);
     for (depth, blocks, bricks) in [(2, 40, 300), (3, 70, 200), (3, 5, 3)] {
         let mut world = World::new(depth, blocks, bricks);
         let mut random = 12_345_u32;
-        for round in 0..35_000 {
+        for round in 0..ROUNDS {
             random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             let number = random >> 8;
             // A window over the ids that moves on, as a view does.
