@@ -187,7 +187,7 @@ fn channels_are_exchanged_without_a_trace() {
     assert!(delivered.len() > 3);
 }
 
-/// With a slot for each of sixteen, one more channel takes the place of another.
+/// With a slot for each of sixteen, one more channel takes the place of another; also in a volume of 64.
 #[test]
 fn the_octree_makes_room_for_other_channels() {
     let Some(gpu) = gpu() else { return };
@@ -202,15 +202,15 @@ fn the_octree_makes_room_for_other_channels() {
     let extent = glam::UVec3::new(40, 40, 40);
     let channel = |n: u32| {
         Scene::new(extent, DVec3::splat(4.0), gray(0.2), move |nm| {
-            let spot = DVec3::new(f64::from(n % 5), f64::from(n / 5), 2.0) * 32.0;
+            let spot = DVec3::new(f64::from(n % 5), f64::from(n / 5 % 5), f64::from(n / 25)) * 32.0;
             230.0 * (1.0 - (nm - spot).length() / 40.0).max(0.05)
         })
     };
-    let scene = Scene::of_channels((0..20).map(channel).collect());
+    let scene = Scene::of_channels((0..64).map(channel).collect());
     let view = view(Camera::around(&scene.volume));
     let all = scene.views();
     let mut exchanged = Renderer::new(&gpu, scene.volume.clone(), Default::default()).unwrap();
-    for set in [&all[..16], &all[4..], &all[..3], &all[10..19]] {
+    for set in [&all[..16], &all[4..20], &all[48..], &all[..3], &all[10..19]] {
         exchanged.set_channels(set).unwrap();
         settle(&mut exchanged, &view, &scene);
         let plain = RendererOptions {
@@ -229,13 +229,13 @@ fn the_octree_makes_room_for_other_channels() {
     let refused = exchanged.set_channels(&twice);
     assert_eq!(refused, Err(ChannelError::Twice { channel: 3 }));
     let mut beyond = all[0].clone();
-    beyond.channel = 20;
+    beyond.channel = 64;
     let refused = exchanged.set_channels(&[beyond]);
-    let channels = 20;
+    let channels = 64;
     assert_eq!(
         refused,
         Err(ChannelError::NoSuchChannel {
-            channel: 20,
+            channel: 64,
             channels
         })
     );

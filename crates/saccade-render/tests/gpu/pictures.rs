@@ -1,13 +1,17 @@
 //! Against the oracle.
 
-use glam::{DVec3, UVec2};
+use std::collections::HashSet;
+
+use glam::{DVec3, UVec2, UVec3};
 use saccade_core::camera::Camera;
 use saccade_core::space::Point;
+use saccade_core::transfer::ColorMap;
+use saccade_core::volume::Polarity;
 use saccade_render::{Image, Renderer, RendererOptions, View};
 
 use crate::harness::{gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
-use crate::scene::{Scene, tissue, waves};
+use crate::scene::{Scene, ramp, tissue, waves};
 
 /// A picture counts as the oracle's from here on \[dB\].
 const SAME: f64 = 45.0;
@@ -93,6 +97,47 @@ fn waves_look_as_the_oracle_says() {
 #[test]
 fn tissue_looks_as_the_oracle_says() {
     compare("tissue", &tissue());
+}
+
+/// Levels as other programs write them: by three, by two and a half, and by another factor on each axis.
+#[test]
+fn levels_of_any_downsampling_look_as_the_oracle_says() {
+    let transfer = ramp(
+        Polarity::Bright,
+        ColorMap::Bone,
+        &[(0.3, 0.0), (0.8, 0.5)],
+        60.0,
+    );
+    let factors = [
+        DVec3::ONE,
+        DVec3::new(3.0, 3.0, 1.0),
+        DVec3::new(7.5, 6.0, 2.5),
+        DVec3::new(15.0, 21.0, 7.0),
+    ];
+    let value = |nm: DVec3| {
+        let wave = (nm.x / 130.0).sin() + (nm.y / 170.0).cos() + (nm.z / 110.0).sin();
+        120.0 + 40.0 * wave
+    };
+    let extent = UVec3::new(131, 97, 53);
+    let scene = Scene::with_levels(
+        extent,
+        DVec3::new(4.0, 4.0, 10.0),
+        &factors,
+        transfer,
+        value,
+    );
+    compare("downsampling", &scene);
+    // All of them were seen.
+    let Some(gpu) = gpu() else { return };
+    let mut renderer = Renderer::new(&gpu, scene.volume.clone(), Default::default()).unwrap();
+    renderer.set_transfer_function(&scene.transfer);
+    let mut seen = HashSet::new();
+    for (_, camera) in cameras(&scene) {
+        let reports = settle(&mut renderer, &View::new(camera, SIZE), &scene);
+        let misses = reports.iter().flat_map(|report| &report.misses);
+        seen.extend(misses.map(|id| id.level()));
+    }
+    assert_eq!(seen, HashSet::from([0, 1, 2, 3]));
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use glam::{DVec3, UVec3};
 use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
+use saccade_core::levels::Level;
 use saccade_core::transfer::{ColorMap, OpacityPoint, TABLE_LEN, TransferFunction};
 use saccade_core::volume::{Dtype, Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
@@ -62,6 +63,36 @@ impl Scene {
             iso: 128.0,
             others: Vec::new(),
             factor: 1,
+        }
+    }
+
+    /// A volume whose levels are coarser than the first by these factors. Each voxel is what its middle is.
+    pub(crate) fn with_levels(
+        extent: UVec3,
+        voxel_nm: DVec3,
+        factors: &[DVec3],
+        transfer: TransferFunction,
+        value: impl Fn(DVec3) -> f64,
+    ) -> Self {
+        let plain = Self::new(extent, voxel_nm, transfer, |_| 0.0);
+        let levels = factors.iter().map(|&downsampling| Level {
+            extent: (extent.as_dvec3() / downsampling).ceil().as_uvec3(),
+            downsampling,
+        });
+        let levels: Vec<_> = levels.collect();
+        let voxels = levels.iter().map(|level| {
+            let voxels = VoxelBox::of_size(level.extent).iter();
+            let middle = |voxel: UVec3| (voxel.as_dvec3() + 0.5) * level.downsampling * voxel_nm;
+            let values = voxels.map(|voxel| value(middle(voxel)).round().clamp(0.0, 255.0) as u8);
+            values.collect()
+        });
+        Self {
+            levels: voxels.collect(),
+            volume: Arc::new(Volume {
+                levels,
+                ..(*plain.volume).clone()
+            }),
+            ..plain
         }
     }
 
