@@ -134,6 +134,8 @@ pub struct Status {
     pub host_bytes: u64,
     /// Requests and failures.
     pub progress: Progress,
+    /// Bricks handed to the renderer so far.
+    pub delivered: u64,
     /// The volume's revision after the newest change seen: the picture is to show it.
     pub revision: u64,
     /// From submission of the newest frame known about until it was known.
@@ -171,6 +173,7 @@ pub struct Session {
     /// Frames without a report.
     pending: VecDeque<Submitted>,
     drawn: u64,
+    delivered: u64,
     drawn_view: Option<View>,
     /// Whether the picture would differ if drawn again.
     dirty: bool,
@@ -243,6 +246,7 @@ impl Session {
             lost: HashSet::new(),
             pending: VecDeque::new(),
             drawn: 0,
+            delivered: 0,
             drawn_view: None,
             dirty: true,
             report: None,
@@ -621,6 +625,7 @@ impl Session {
         };
         let delivery = self.pull.deliver(self.drawn + 1, || clock.now(), sink);
         self.dirty |= delivery.bricks > 0;
+        self.delivered += delivery.bricks as u64;
         if !judged.is_empty() {
             for channel in judged {
                 self.channels[channel].finest_needed = self.contents[channel].finest_needed();
@@ -666,6 +671,7 @@ impl Session {
             memory: self.renderer.memory(),
             host_bytes: self.pull.host_bytes(),
             progress,
+            delivered: self.delivered,
             revision: self.revision,
             frame_time: self.frame_time,
             frame_size: self.frame_size,

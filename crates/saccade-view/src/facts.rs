@@ -281,6 +281,7 @@ mod tests {
             },
             host_bytes: 0,
             progress: Progress::default(),
+            delivered: 0,
             revision: 14,
             frame_time: Some(Duration::from_millis(12)),
             frame_size: glam::UVec2::new(640, 480),
