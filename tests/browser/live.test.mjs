@@ -4,7 +4,7 @@ import { access, appendFile, readFile, writeFile } from 'node:fs/promises';
 import { join } from 'node:path';
 import { after, before, test } from 'node:test';
 
-import { launch, open, reportShaders } from './lib/browser.mjs';
+import { launch, open, rememberDevices, reportShaders } from './lib/browser.mjs';
 import { covered, grayPng, picture, psnr } from './lib/picture.mjs';
 import { folder, run, start, until } from './lib/saccade.mjs';
 
@@ -43,6 +43,7 @@ before(async () => {
   browser = await launch();
   ({ page, complaints } = await open(browser, SIZE));
   await reportShaders(page);
+  await rememberDevices(page);
 });
 
 after(async () => {
@@ -87,6 +88,26 @@ test('a tile ingested afterwards changes the picture without a reload', async ()
   const agreement = psnr(shown, await rendered(CAMERA));
   assert.ok(agreement >= AGREE_DB, `the pictures agree to ${agreement} dB only`);
   assert.equal(await page.evaluate(() => window.notReloaded), true);
+});
+
+test('a lost device is replaced, and the picture returns', async () => {
+  const before = await shot();
+  const devices = await page.evaluate(() => window.devices.length);
+  assert.ok(devices > 0, 'no device was seen');
+  // Nobody moves: the page notices by itself.
+  await page.evaluate(() => window.devices.at(-1).destroy());
+  await until('there is another device', () => page.evaluate((n) => window.devices.length > n, devices), 60);
+  await until('the picture is there', async () => psnr(before, await shot()) >= AGREE_DB, 120);
+  await settled();
+  assert.equal(await page.evaluate(() => window.notReloaded), true);
+  assert.equal(await page.evaluate(() => window.saccade.error), null);
+
+  // It is drawn by the new device: what changes from here on shows.
+  const record = { record: 'delete', tile: 'late' };
+  await appendFile(join(work.path, 'acquisition', 'tiles.jsonl'), JSON.stringify(record) + '\n');
+  await settled();
+  const change = psnr(before, await shot());
+  assert.ok(change < AGREE_DB - 15, `the picture does not change any more: ${change} dB`);
 });
 
 test('the browser takes every shader without a word', async () => {

@@ -1,5 +1,6 @@
 //! The device everything is drawn with.
 
+use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
@@ -11,8 +12,21 @@ pub struct Gpu {
     device: wgpu::Device,
     queue: wgpu::Queue,
     adapter: wgpu::AdapterInfo,
-    lost: Arc<AtomicBool>,
+    lost: Arc<Loss>,
     ray_caster: Arc<OnceLock<RayCaster>>,
+}
+
+/// Whether a device is gone, and who is told.
+#[derive(Default)]
+struct Loss {
+    is_lost: AtomicBool,
+    tell: OnceLock<Box<dyn Fn() + Send + Sync>>,
+}
+
+impl fmt::Debug for Loss {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Loss").field(&self.is_lost).finish()
+    }
 }
 
 /// There is no device to draw with.
@@ -98,14 +112,17 @@ impl Gpu {
         queue: wgpu::Queue,
         adapter: wgpu::AdapterInfo,
     ) -> Self {
-        let lost = Arc::new(AtomicBool::new(false));
+        let lost = Arc::new(Loss::default());
         device.on_uncaptured_error(Arc::new(|error| log::error!("GPU: {error}")));
-        let flag = Arc::clone(&lost);
+        let loss = Arc::clone(&lost);
         device.set_device_lost_callback(move |reason, message| {
             if reason != wgpu::DeviceLostReason::Destroyed {
                 log::error!("GPU lost: {message}");
             }
-            flag.store(true, Ordering::Release);
+            loss.is_lost.store(true, Ordering::Release);
+            if let Some(tell) = loss.tell.get() {
+                tell();
+            }
         });
         Self {
             device,
@@ -133,7 +150,19 @@ impl Gpu {
 
     /// Whether the device is gone, and everything made with it.
     pub fn is_lost(&self) -> bool {
-        self.lost.load(Ordering::Acquire)
+        self.lost.is_lost.load(Ordering::Acquire)
+    }
+
+    /// Has `tell` called when the device is gone, from any thread, once or twice: soon in browsers, natively with the next work that is
+    /// given to the device. Only the first `tell` counts.
+    pub fn when_lost(&self, tell: impl Fn() + Send + Sync + 'static) {
+        let _ = self.lost.tell.set(Box::new(tell));
+        // Between the two it may have gone.
+        if self.is_lost()
+            && let Some(tell) = self.lost.tell.get()
+        {
+            tell();
+        }
     }
 
     pub(crate) fn ray_caster(&self) -> &RayCaster {

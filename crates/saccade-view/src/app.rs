@@ -1,13 +1,14 @@
 //! The application itself: input to camera, camera to picture, picture to screen.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use eframe::egui_wgpu::RenderState;
 use egui::{CentralPanel, Key, Panel, PointerButton, Response, Sense, Ui};
 use glam::{DVec2, dvec2};
 use saccade_core::camera::Camera;
-use saccade_render::{ChannelError, View};
+use saccade_render::wgpu::DeviceType;
+use saccade_render::{ChannelError, Gpu, View};
 use saccade_source::VolumeSource;
 use saccade_stream::{Again, Session, SessionError, SessionOptions, Status, Wake};
 use web_time::Instant;
@@ -19,17 +20,20 @@ use crate::options::{ViewOptions, set_details, show_channels};
 use crate::panel::{self, About, Open, Opener, Settings};
 use crate::picture::{Picture, Place};
 use crate::quality::{Cost, Events, Quality};
+use crate::revival::Revivals;
 use crate::setup::gpu_of;
 use crate::transfer_editor::TransferEditor;
 
 /// The application.
 pub(crate) struct App {
-    session: Session,
+    pub(crate) session: Session,
     state: RenderState,
+    /// Of the window there is now.
+    context: Arc<Mutex<egui::Context>>,
     wake: Wake,
     ui: bool,
     home: Camera,
-    camera: Camera,
+    pub(crate) camera: Camera,
     settings: Settings,
     editor: TransferEditor,
     panel_open: bool,
@@ -39,23 +43,35 @@ pub(crate) struct App {
     acquisition: Acquisition,
     notes: Vec<String>,
     opener: Option<Opener>,
-    status: Option<Status>,
-    preview: bool,
+    pub(crate) status: Option<Status>,
+    pub(crate) preview: bool,
     /// Whether the volume changed since the size of the picture was chosen.
     changed: bool,
     start: Instant,
     /// What scripts are told after each frame, as JSON.
     publish: Box<dyn Fn(String)>,
     /// What is done once the GPU is gone.
-    lost: Box<dyn Fn()>,
+    lost: Box<dyn Fn(Loss)>,
+    revivals: Revivals,
+    /// The GPU is gone, and [`Self::lost`] was told.
+    is_lost: bool,
+}
+
+/// What is left of a window whose GPU is gone.
+#[derive(Clone, Debug)]
+pub(crate) struct Loss {
+    /// Of the window.
+    pub(crate) context: egui::Context,
+    /// Whether another device is worth a try: not where one after another is lost.
+    pub(crate) may_revive: bool,
 }
 
 /// What surrounds the application.
 pub(crate) struct Surroundings {
     /// Given the status as JSON after each frame.
     pub(crate) publish: Box<dyn Fn(String)>,
-    /// Called when the GPU is gone.
-    pub(crate) lost: Box<dyn Fn()>,
+    /// Called once when a GPU is gone.
+    pub(crate) lost: Box<dyn Fn(Loss)>,
     /// Where the state of the acquisition is asked for.
     pub(crate) acquisition: Option<AcquisitionReader>,
     /// What the user should know of how values are shown, in sentences.
@@ -70,6 +86,9 @@ pub(crate) enum StartError {
     /// The window draws without a GPU.
     #[error("the window has no GPU device")]
     NoDevice,
+    /// The application was lost with its window.
+    #[error("there is nothing left to show")]
+    Gone,
     /// The volume cannot be shown.
     #[error(transparent)]
     Session(#[from] SessionError),
@@ -85,15 +104,14 @@ impl App {
         options: ViewOptions,
         surroundings: Surroundings,
     ) -> Result<Self, StartError> {
-        let state = context
-            .wgpu_render_state
-            .clone()
-            .ok_or(StartError::NoDevice)?;
+        let state = state_of(context)?;
         context.egui_ctx.set_theme(egui::Theme::Dark);
-        let repaint = context.egui_ctx.clone();
-        let wake: Wake = Arc::new(move || repaint.request_repaint());
+        let window = Arc::new(Mutex::new(context.egui_ctx.clone()));
+        let repaint = window.clone();
+        let wake: Wake = Arc::new(move || lock(&repaint).request_repaint());
         let gpu = gpu_of(&state);
-        let software = gpu.adapter().device_type == saccade_render::wgpu::DeviceType::Cpu;
+        gpu.when_lost(asks_to_repaint(&context.egui_ctx));
+        let software = is_software(&gpu);
         let session_options = SessionOptions {
             gpu_bytes: options.gpu_bytes,
             limits: options.limits,
@@ -107,6 +125,7 @@ impl App {
         Ok(Self {
             session,
             state,
+            context: window,
             wake,
             ui: options.ui,
             home,
@@ -136,7 +155,50 @@ impl App {
             start: start(),
             publish: surroundings.publish,
             lost: surroundings.lost,
+            revivals: Revivals::default(),
+            is_lost: false,
         })
+    }
+
+    /// Goes on in a new window, whose device is another, with all that was chosen and read in the last one.
+    pub(crate) fn revive(
+        &mut self,
+        context: &eframe::CreationContext<'_>,
+    ) -> Result<(), StartError> {
+        let state = state_of(context)?;
+        let gpu = gpu_of(&state);
+        self.session.set_gpu(&gpu)?;
+        gpu.when_lost(asks_to_repaint(&context.egui_ctx));
+        self.state = state;
+        // Widths of panels and the like.
+        let before = std::mem::replace(&mut *lock(&self.context), context.egui_ctx.clone());
+        let widgets = before.data(Clone::clone);
+        context.egui_ctx.data_mut(|data| *data = widgets);
+        context.egui_ctx.set_theme(egui::Theme::Dark);
+        self.picture = Picture::default();
+        self.quality = Quality::new(is_software(&gpu));
+        self.cost = Cost::default();
+        self.status = None;
+        self.is_lost = false;
+        Ok(())
+    }
+
+    /// Whether the window ended since its device was lost.
+    pub(crate) fn is_lost(&self) -> bool {
+        self.is_lost
+    }
+
+    /// Tells once that the device is lost; nothing is drawn with it any more.
+    fn leave(&mut self, context: &egui::Context) {
+        // What draws the user interface would fail at buffers that there are no more.
+        context.graphics_mut(|layers| *layers = Default::default());
+        if !std::mem::replace(&mut self.is_lost, true) {
+            let may_revive = self.revivals.may_revive(self.start.elapsed());
+            (self.lost)(Loss {
+                context: context.clone(),
+                may_revive,
+            });
+        }
     }
 
     /// The panels around the picture. They show what the last frame told.
@@ -225,9 +287,6 @@ impl App {
             .paint(ui.painter(), place, self.session.renderer(), &self.state);
         self.publish_status(&status, &view);
         self.schedule(ui, &status, now);
-        if status.lost && !self.status.as_ref().is_some_and(|before| before.lost) {
-            (self.lost)();
-        }
         let revision = self
             .status
             .as_ref()
@@ -292,10 +351,16 @@ impl App {
 
 impl eframe::App for App {
     fn ui(&mut self, ui: &mut Ui, _frame: &mut eframe::Frame) {
-        if self.ui {
-            self.panels(ui);
+        let is_gone = |app: &Self| app.session.renderer().gpu().is_lost();
+        if !is_gone(self) {
+            if self.ui {
+                self.panels(ui);
+            }
+            CentralPanel::no_frame().show(ui, |ui| self.scene(ui));
         }
-        CentralPanel::no_frame().show(ui, |ui| self.scene(ui));
+        if is_gone(self) {
+            self.leave(ui.ctx());
+        }
     }
 
     fn clear_color(&self, _visuals: &egui::Visuals) -> [f32; 4] {
@@ -305,6 +370,25 @@ impl eframe::App for App {
     fn persist_egui_memory(&self) -> bool {
         false
     }
+}
+
+fn state_of(context: &eframe::CreationContext<'_>) -> Result<RenderState, StartError> {
+    let state = context.wgpu_render_state.clone();
+    state.ok_or(StartError::NoDevice)
+}
+
+/// Where nothing changes nothing is drawn, and a loss would show only when somebody moves.
+fn asks_to_repaint(context: &egui::Context) -> impl Fn() + Send + Sync + 'static {
+    let context = context.clone();
+    move || context.request_repaint()
+}
+
+fn is_software(gpu: &Gpu) -> bool {
+    gpu.adapter().device_type == DeviceType::Cpu
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg_attr(

@@ -20,8 +20,10 @@
 //!
 //! # Failure
 //!
-//! A missing GPU or a lost one ends the application with a message that says what to install or
-//! do. Missing data do not: the fidelity line tells.
+//! A missing GPU ends the application with a message that says what to install or do. A lost one is
+//! replaced: the window, or the page's canvas, is made anew with another device, everything as it was chosen, and the
+//! picture returns from main memory; only where one device after another is lost, a message says so. Missing data end
+//! nothing: the fidelity line tells.
 //!
 //! # What it does not do
 //!
@@ -31,6 +33,7 @@
 mod acquisition;
 mod app;
 mod facts;
+mod handover;
 mod navigate;
 mod options;
 mod page;
@@ -38,6 +41,7 @@ mod panel;
 mod picture;
 mod plane;
 mod quality;
+mod revival;
 mod setup;
 mod shown;
 mod transfer_editor;

@@ -1,12 +1,16 @@
 //! The application in a window of its own.
 
+use std::cell::RefCell;
+use std::rc::Rc;
 use std::sync::Arc;
 
+use egui::ViewportInfo;
 use saccade_source::remote::{RemoteSource, volumes};
 use saccade_source::{SourceError, VolumeSource};
 
 use crate::acquisition::{AcquisitionReader, from_server};
-use crate::app::{App, Surroundings};
+use crate::app::Surroundings;
+use crate::handover::{Handover, Shown};
 use crate::options::ViewOptions;
 use crate::setup::wgpu_options;
 
@@ -51,9 +55,9 @@ pub enum ViewError {
         /// What the adapters said.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// The driver gave up while the window was open.
+    /// The driver gave up while the window was open, and again with each device that came next.
     #[error(
-        "the GPU was lost; restart, and if it happens again update the driver or use less memory"
+        "the GPU was lost again and again; update its driver, or use less of its memory (--gpu-memory)"
     )]
     Lost,
     /// No display, or no window on it.
@@ -72,7 +76,8 @@ pub enum ViewError {
     },
 }
 
-/// Opens a window and returns when it is closed.
+/// Opens a window and returns when it is closed. Should the GPU be lost, the window is opened again with another
+/// device, in its place and with all that was chosen.
 ///
 /// To be awaited on the program's first thread, as windows demand, inside of a multi-threaded Tokio
 /// runtime; it blocks that thread.
@@ -82,39 +87,90 @@ pub enum ViewError {
 /// [`ViewError`] says what to install or to change.
 pub async fn run(spec: SourceSpec, options: ViewOptions) -> Result<(), ViewError> {
     let (source, acquisition) = open(spec).await?;
-    let title = format!("{} · Saccade", source.volume().name);
-    let native = eframe::NativeOptions {
-        viewport: egui::ViewportBuilder::default()
-            .with_title(title)
-            .with_inner_size([1280.0, 800.0]),
-        renderer: eframe::Renderer::Wgpu,
-        wgpu_options: wgpu_options(),
-        dithering: false,
-        ..Default::default()
-    };
-    let lost = Arc::new(std::sync::atomic::AtomicBool::new(false));
-    let flag = lost.clone();
-    let create = Box::new(move |context: &eframe::CreationContext<'_>| {
-        let close = context.egui_ctx.clone();
+    let windows = Windows::new(source, acquisition, options);
+    windows.run(eframe::NativeOptions::default, |app| Box::new(app))
+}
+
+/// One window after another: each ends when it is closed, or when its device is lost.
+struct Windows {
+    title: String,
+    handover: Handover,
+    /// What was known of the last window whose device was lost, and whether another is worth a try.
+    lost: Rc<RefCell<Option<(ViewportInfo, bool)>>>,
+}
+
+impl Windows {
+    fn new(
+        source: Arc<dyn VolumeSource>,
+        acquisition: Option<AcquisitionReader>,
+        options: ViewOptions,
+    ) -> Self {
+        let lost: Rc<RefCell<Option<_>>> = Rc::default();
+        let told = lost.clone();
         let surroundings = Surroundings {
             publish: Box::new(|_| ()),
-            lost: Box::new(move || {
-                flag.store(true, std::sync::atomic::Ordering::Release);
-                close.send_viewport_cmd(egui::ViewportCommand::Close);
+            lost: Box::new(move |loss| {
+                let window = loss.context.input(|input| input.viewport().clone());
+                told.replace(Some((window, loss.may_revive)));
+                loss.context.send_viewport_cmd(egui::ViewportCommand::Close);
             }),
             acquisition,
             // Whoever opened the image has told them.
             notes: Vec::new(),
             open: None,
         };
-        let app = App::new(context, source, options, surroundings)?;
-        Ok(Box::new(app) as Box<dyn eframe::App>)
-    });
-    eframe::run_native("saccade", native, create).map_err(view_error)?;
-    if lost.load(std::sync::atomic::Ordering::Acquire) {
-        Err(ViewError::Lost)
-    } else {
-        Ok(())
+        Self {
+            title: format!("{} · Saccade", source.volume().name),
+            handover: Handover::new(source, options, surroundings),
+            lost,
+        }
+    }
+
+    /// Opens windows until one is closed. `around` is what is put around the application in each.
+    fn run<'a>(
+        &'a self,
+        options: impl Fn() -> eframe::NativeOptions,
+        around: impl Fn(Shown) -> Box<dyn eframe::App + 'a>,
+    ) -> Result<(), ViewError> {
+        loop {
+            let native = eframe::NativeOptions {
+                viewport: self.viewport(),
+                renderer: eframe::Renderer::Wgpu,
+                wgpu_options: wgpu_options(),
+                dithering: false,
+                ..options()
+            };
+            let create = Box::new(|context: &eframe::CreationContext<'_>| {
+                Ok(around(self.handover.window(context)?))
+            });
+            eframe::run_native("saccade", native, create).map_err(view_error)?;
+            if !self.handover.is_lost() {
+                return Ok(());
+            }
+            let may_revive = self.lost.borrow().as_ref().is_some_and(|(_, may)| *may);
+            if !may_revive {
+                return Err(ViewError::Lost);
+            }
+            log::warn!("the GPU was lost; going on with a new device");
+        }
+    }
+
+    /// Where the last window was, if there was one.
+    fn viewport(&self) -> egui::ViewportBuilder {
+        let usual = egui::vec2(1280.0, 800.0);
+        let builder = egui::ViewportBuilder::default().with_title(&self.title);
+        let lost = self.lost.borrow();
+        let Some((before, _)) = lost.as_ref() else {
+            return builder.with_inner_size(usual);
+        };
+        let size = before.inner_rect.map_or(usual, |rect| rect.size());
+        let mut builder = builder.with_inner_size(size);
+        if let Some(outer) = before.outer_rect {
+            builder = builder.with_position(outer.min);
+        }
+        builder
+            .with_maximized(before.maximized.unwrap_or(false))
+            .with_fullscreen(before.fullscreen.unwrap_or(false))
     }
 }
 
@@ -154,3 +210,6 @@ fn view_error(error: eframe::Error) -> ViewError {
         },
     }
 }
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests;

@@ -3,6 +3,8 @@
 use std::cell::RefCell;
 use std::sync::Arc;
 
+use futures::StreamExt as _;
+use futures::channel::mpsc;
 use saccade_source::objects::Location;
 use saccade_source::remote::{RemoteSource, volumes};
 use saccade_source::{VolumeSource, images, workers};
@@ -10,7 +12,8 @@ use wasm_bindgen::prelude::{JsCast, JsValue, wasm_bindgen};
 use web_sys::HtmlCanvasElement;
 
 use crate::acquisition::{AcquisitionReader, from_server};
-use crate::app::{App, Surroundings};
+use crate::app::Surroundings;
+use crate::handover::Handover;
 use crate::page::PageOptions;
 use crate::setup::wgpu_options;
 
@@ -84,29 +87,65 @@ async fn run(canvas_id: &str) -> Result<(), String> {
     let seen = page.view.shown.check(opened.source.volume());
     seen.map_err(|error| format!("The page's address asks for what is not there: {error}."))?;
 
-    let options = eframe::WebOptions {
-        wgpu_options: wgpu_options(),
-        dithering: false,
-        ..Default::default()
-    };
+    let (tell, losses) = mpsc::unbounded();
     let surroundings = Surroundings {
         publish: Box::new(|json| STATUS.set(json)),
-        lost: Box::new(tell_lost),
+        lost: Box::new(move |loss| {
+            // Somebody listens for as long as the page is open.
+            let _ = tell.unbounded_send(loss.may_revive);
+        }),
         acquisition: opened.acquisition,
         notes: opened.notes,
         open: Some(Box::new(go_to_image)),
     };
-    let (view, source) = (page.view, opened.source);
-    let create = Box::new(move |context: &eframe::CreationContext<'_>| {
-        let app = App::new(context, source, view, surroundings)?;
-        Ok(Box::new(app) as Box<dyn eframe::App>)
-    });
-    let runner = eframe::WebRunner::new();
-    let started = runner.start(canvas, options, create).await;
-    started.map_err(|error| error.as_string().unwrap_or_else(|| format!("{error:?}")))?;
+    let drawn = Drawn {
+        canvas,
+        runner: eframe::WebRunner::new(),
+        handover: Handover::new(opened.source, page.view, surroundings),
+    };
+    drawn.start().await?;
     // The application runs for as long as the page is open.
-    std::mem::forget(runner);
+    wasm_bindgen_futures::spawn_local(drawn.revive(losses));
     Ok(())
+}
+
+/// The application on its canvas.
+struct Drawn {
+    canvas: HtmlCanvasElement,
+    runner: eframe::WebRunner,
+    handover: Handover,
+}
+
+impl Drawn {
+    /// Draws with a new device, instead of the last one if there was one.
+    async fn start(&self) -> Result<(), String> {
+        let options = eframe::WebOptions {
+            wgpu_options: wgpu_options(),
+            dithering: false,
+            ..Default::default()
+        };
+        let handover = self.handover.clone();
+        let create = Box::new(move |context: &eframe::CreationContext<'_>| {
+            Ok(Box::new(handover.window(context)?) as Box<dyn eframe::App>)
+        });
+        let started = self.runner.start(self.canvas.clone(), options, create);
+        let started = started.await;
+        started.map_err(|error| error.as_string().unwrap_or_else(|| format!("{error:?}")))
+    }
+
+    /// Replaces devices that are lost, and says where that does not help.
+    async fn revive(self, mut losses: mpsc::UnboundedReceiver<bool>) {
+        while let Some(may_revive) = losses.next().await {
+            if !may_revive {
+                return tell_lost();
+            }
+            log::info!("the GPU was lost; going on with a new device");
+            if let Err(error) = self.start().await {
+                log::error!("no other device: {error}");
+                return tell_lost();
+            }
+        }
+    }
 }
 
 /// What the page shows.

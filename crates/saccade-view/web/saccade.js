@@ -25,7 +25,7 @@ window.saccade = {
 };
 
 window.saccadeLost = () =>
-  fail("The graphics device was lost.\nReload the page. If it happens again, close other tabs that draw, or update the graphics driver.");
+  fail("The graphics device was lost again and again.\nReload the page. If it happens again, close other tabs that draw, or update the graphics driver.");
 
 const noWebGpu = `Saccade draws with WebGPU, and this browser does not offer it here.
 

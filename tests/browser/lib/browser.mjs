@@ -42,6 +42,20 @@ export async function open(browser, { width, height }) {
   return { page, complaints };
 }
 
+/** Keeps the devices that the page was given in `window.devices`, the newest last. */
+export async function rememberDevices(page) {
+  await page.addInitScript(() => {
+    window.devices = [];
+    const request = globalThis.GPUAdapter?.prototype.requestDevice;
+    if (!request) return;
+    GPUAdapter.prototype.requestDevice = async function (...descriptor) {
+      const device = await request.apply(this, descriptor);
+      window.devices.push(device);
+      return device;
+    };
+  });
+}
+
 /** Makes every shader's compilation messages complaints: a browser keeps warnings to itself. */
 export async function reportShaders(page) {
   await page.addInitScript(() => {
