@@ -74,11 +74,16 @@ struct Hand<'a> {
     source: Arc<Blobs>,
     losses: u32,
     asked: bool,
+    loses: bool,
     shot: Arc<Mutex<Option<Arc<ColorImage>>>>,
 }
 
 impl eframe::App for Hand<'_> {
     fn ui(&mut self, ui: &mut egui::Ui, frame: &mut eframe::Frame) {
+        if std::mem::take(&mut self.loses) {
+            let gpu = self.shown.app_mut().session.renderer().gpu();
+            gpu.device().destroy();
+        }
         self.shown.ui(ui, frame);
         let mut seen = self.seen.borrow_mut();
         let context = ui.ctx();
@@ -97,7 +102,8 @@ impl eframe::App for Hand<'_> {
             if seen.pictures.len() == 1 {
                 app.camera = app.camera.orbited(50.0, 20.0);
             } else if seen.windows <= self.losses {
-                app.session.renderer().gpu().device().destroy();
+                // Before the next frame: as drivers do, it goes while something is drawn.
+                self.loses = true;
             } else {
                 context.send_viewport_cmd(ViewportCommand::Close);
             }
@@ -138,6 +144,7 @@ fn look(losses: u32) -> (Result<(), ViewError>, Seen) {
             source: source.clone(),
             losses,
             asked: false,
+            loses: false,
             shot: Arc::default(),
         })
     });
