@@ -143,14 +143,31 @@ impl BrickValues {
                 values.extend(xs.iter().map(|x| of_gaps(&low, &high, bins, [x, y, z])));
             }
         }
-        let all = 0..GAPS;
-        let whole = of_gaps(&low, &high, bins, [&all, &all, &all]);
+        let whole = if regions.iter().all(|ranges| cover_all(ranges)) {
+            // Each gap was looked at once already.
+            values.iter().fold(Values::NONE, |all, v| all.or(*v))
+        } else {
+            let all = 0..GAPS;
+            of_gaps(&low, &high, bins, [&all, &all, &all])
+        };
         let alike = values.iter().all(|v| *v == whole);
         Self {
             whole,
             regions: (!alike).then_some(values),
         }
     }
+}
+
+/// Whether ranges in order leave no gap out.
+fn cover_all(ranges: &[Range<usize>]) -> bool {
+    let mut end = 0;
+    for range in ranges {
+        if range.start > end {
+            return false;
+        }
+        end = end.max(range.end);
+    }
+    end >= GAPS
 }
 
 fn zeros<T: Copy + Default>(count: usize) -> Vec<T> {
