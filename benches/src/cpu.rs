@@ -24,24 +24,26 @@ pub(crate) fn of_children() -> Result<Duration> {
 pub(crate) fn of_thread() -> Result<Duration> {
     let stat = fs::read_to_string("/proc/thread-self/schedstat")
         .context("a thread's processor time needs /proc")?;
-    let spent = stat.split_whitespace().next();
-    let nanoseconds = spent.and_then(|n| n.parse().ok());
-    Ok(Duration::from_nanos(nanoseconds.context(
-        "/proc/thread-self/schedstat has an unknown form",
-    )?))
+    nanoseconds(&stat)
 }
 
-/// The same of all threads of this process that have not ended, to the scheduler's ticks.
+/// The same of all threads that run now, which is finer than [`time`].
 pub(crate) fn of_threads() -> Result<Duration> {
-    let tasks = fs::read_dir("/proc/self/task").context("processor time needs /proc")?;
     let mut sum = Duration::ZERO;
-    for task in tasks {
-        // A thread may have ended meanwhile.
-        let stat = fs::read_to_string(task?.path().join("schedstat")).unwrap_or_default();
-        let spent = stat.split_whitespace().next();
-        sum += Duration::from_nanos(spent.and_then(|n| n.parse().ok()).unwrap_or(0));
+    for thread in fs::read_dir("/proc/self/task").context("processor time needs /proc")? {
+        // One that ends meanwhile counts no more.
+        if let Ok(stat) = fs::read_to_string(thread?.path().join("schedstat")) {
+            sum += nanoseconds(&stat)?;
+        }
     }
     Ok(sum)
+}
+
+fn nanoseconds(stat: &str) -> Result<Duration> {
+    let spent = stat.split_whitespace().next();
+    let spent = spent.and_then(|n| n.parse().ok());
+    let spent = spent.context("a thread's schedstat has an unknown form")?;
+    Ok(Duration::from_nanos(spent))
 }
 
 fn in_time(ticks: Option<u64>) -> Result<Duration> {
@@ -80,23 +82,22 @@ mod tests {
     }
 
     #[test]
-    fn threads_are_added() {
+    fn other_threads_count() {
         let before = of_threads().unwrap();
-        let work = || {
-            let start = of_thread().unwrap();
+        let (stop, stopped) = std::sync::mpsc::channel::<()>();
+        let busy = std::thread::spawn(move || {
             let mut sum = 0_u64;
-            while of_thread().unwrap() - start < Duration::from_millis(30) {
+            while stopped.try_recv().is_err() {
                 sum = std::hint::black_box(sum + 1);
             }
-            of_threads().unwrap() - before
-        };
-        let here = work();
-        let with_another = std::thread::spawn(work).join().unwrap();
-        assert!(here >= Duration::from_millis(30), "{here:?}");
-        assert!(
-            with_another >= here + Duration::from_millis(30),
-            "{with_another:?}"
-        );
+            sum
+        });
+        while of_threads().unwrap() < before + Duration::from_millis(30) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(of_thread().unwrap() < Duration::from_secs(5));
+        drop(stop.send(()));
+        busy.join().unwrap();
     }
 
     #[test]

@@ -102,6 +102,8 @@ impl Bricks for Formula {
 pub(crate) struct Tissue {
     pub(crate) volume: Arc<Volume>,
     levels: Vec<Phantom>,
+    /// Bricks made so far: those of coarse levels take a second.
+    made: Mutex<HashMap<BrickId, Arc<[u8]>>>,
 }
 
 impl Tissue {
@@ -118,12 +120,11 @@ impl Tissue {
         Ok(Self {
             volume: Arc::new(volume),
             levels,
+            made: Mutex::default(),
         })
     }
-}
 
-impl Bricks for Tissue {
-    fn brick(&self, id: BrickId) -> Option<Vec<u8>> {
+    fn make(&self, id: BrickId) -> Vec<u8> {
         let mut sampler = self.levels[id.level() as usize].sampler();
         let extent = self.volume.levels[id.level() as usize].extent.as_ivec3();
         let low = (id.brick() * BRICK_EDGE).as_ivec3() - BRICK_BORDER.cast_signed();
@@ -142,7 +143,19 @@ impl Bricks for Tissue {
                 voxels.extend((0..edge).map(|x| row[x.saturating_sub(before).min(inside - 1)]));
             }
         }
-        Some(voxels)
+        voxels
+    }
+}
+
+impl Bricks for Tissue {
+    fn brick(&self, id: BrickId) -> Option<Vec<u8>> {
+        let made = || self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(brick) = made().get(&id) {
+            return Some(brick.to_vec());
+        }
+        let brick = self.make(id);
+        made().insert(id, brick.as_slice().into());
+        Some(brick)
     }
 }
 
@@ -157,6 +170,8 @@ pub(crate) struct Case {
 pub(crate) enum Scale {
     /// For drivers that draw on the CPU.
     Small,
+    /// As large as such a driver draws in minutes: each ray meets about half as many bricks as in the papers, or as many.
+    Medium,
     /// As published.
     Paper,
 }
@@ -249,15 +264,19 @@ impl DataSet {
 
     fn extent(self, scale: Scale) -> UVec3 {
         let [x, y, z] = match (self, scale) {
-            (Self::Aneurism | Self::Bonsai, Scale::Paper) => [256; 3],
+            (Self::Aneurism | Self::Bonsai, Scale::Medium | Scale::Paper) => [256; 3],
             (Self::Aneurism | Self::Bonsai, Scale::Small) => [96; 3],
             (Self::Kingsnake, Scale::Paper) => [1024, 1024, 795],
+            (Self::Kingsnake, Scale::Medium) => [512, 512, 398],
             (Self::Kingsnake, Scale::Small) => [160, 160, 124],
             (Self::CycifSmall, Scale::Paper) => [1024, 1024, 40],
+            (Self::CycifSmall, Scale::Medium) => [256, 256, 40],
             (Self::CycifSmall, Scale::Small) => [64, 64, 40],
             (Self::CycifMedium, Scale::Paper) => [1024, 1024, 105],
+            (Self::CycifMedium, Scale::Medium) => [256, 256, 105],
             (Self::CycifMedium, Scale::Small) => [64, 64, 53],
             (Self::CycifLarge, Scale::Paper) => [5632, 4352, 160],
+            (Self::CycifLarge, Scale::Medium) => [704, 544, 160],
             (Self::CycifLarge, Scale::Small) => [176, 136, 80],
         };
         UVec3::new(x, y, z)

@@ -13,7 +13,6 @@ use super::Method;
 use super::paged::Paged;
 use super::table::{Table, largest, single};
 use crate::bricks::{Bricks, all_bricks};
-use crate::clock::Stopwatch;
 use crate::shader::shader_module;
 
 /// As the shader has them.
@@ -274,16 +273,19 @@ impl Baseline {
         self.gpu.queue().write_texture(target, voxels, rows, size);
     }
 
-    /// Time of a frame, from asking for it until the GPU has finished it: the mean of so many that are
-    /// asked for at once \[ms\].
-    pub(crate) fn frame_ms(&mut self, view: &View, frames: u32) -> Result<f64> {
-        let start = Stopwatch::start();
+    /// The device drawn with.
+    pub(crate) fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
+    /// Draws so many frames, which are asked for at once, and waits for the last.
+    pub(crate) fn frames(&mut self, view: &View, frames: u32) -> Result<()> {
         self.draw(view, false, frames)?;
         self.gpu
             .device()
             .poll(wgpu::PollType::wait_indefinitely())
             .context("the device was lost")?;
-        Ok(start.elapsed().as_secs_f64() * 1e3 / f64::from(frames))
+        Ok(())
     }
 
     fn draw(&mut self, view: &View, counting: bool, frames: u32) -> Result<()> {
@@ -515,18 +517,19 @@ fn layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
 
 /// The source of a method's ray-caster.
 pub(super) fn shader(method: Method, channels: usize) -> String {
-    let stack = if method == Method::ShortStack {
+    let stack = if matches!(method, Method::ShortStack | Method::SampledOctree) {
         STACK
     } else {
         0
     };
     let hides = method == Method::HidingPageTables;
+    let each = method.is_sampled();
     let traversal = match method.is_octree() {
         true => include_str!("octree.wgsl"),
         false => include_str!("page_tables.wgsl"),
     };
     format!(
-        "const SLOTS = {channels}u;\nconst STACK = {stack}u;\nconst HIDES = {hides};\n{}{traversal}",
+        "const SLOTS = {channels}u;\nconst STACK = {stack}u;\nconst HIDES = {hides};\nconst EACH_SAMPLE = {each};\n{}{traversal}",
         include_str!("ray_cast.wgsl")
     )
 }

@@ -17,19 +17,41 @@ pub(crate) enum Method {
     KdRestart,
     /// An octree of bricks, entered at the lowest of four remembered nodes that holds the place.
     ShortStack,
+    /// [`Self::PageTables`] looked up for every sample of every channel, as published \[001 §9.2.1\].
+    SampledPageTables,
+    /// [`Self::ShortStack`] searched for every sample of every channel, as published \[001 §9.2.2\].
+    SampledOctree,
 }
 
 impl Method {
-    /// All of them.
-    pub(crate) const ALL: [Self; 4] = [
+    /// Those that sample a brick to its end before they search again.
+    pub(crate) const BY_BRICK: [Self; 4] = [
         Self::PageTables,
         Self::HidingPageTables,
         Self::KdRestart,
         Self::ShortStack,
     ];
 
+    /// All of them.
+    pub(crate) const ALL: [Self; 6] = [
+        Self::PageTables,
+        Self::HidingPageTables,
+        Self::KdRestart,
+        Self::ShortStack,
+        Self::SampledPageTables,
+        Self::SampledOctree,
+    ];
+
     fn is_octree(self) -> bool {
-        matches!(self, Self::KdRestart | Self::ShortStack)
+        matches!(
+            self,
+            Self::KdRestart | Self::ShortStack | Self::SampledOctree
+        )
+    }
+
+    /// Whether each sample is searched for anew.
+    fn is_sampled(self) -> bool {
+        matches!(self, Self::SampledPageTables | Self::SampledOctree)
     }
 }
 

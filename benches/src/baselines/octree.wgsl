@@ -53,7 +53,7 @@ fn find(channel: u32, wanted: u32, depth: f32, ray: vec3f) -> Spot {
             stack_top[channel] = min(stack_top[channel], level + STACK - 1u);
         }
         let entry = index[first + 1u + 2u * channel];
-        mark_used(entry);
+        mark_used(channel, entry);
         if entry == MISSING {
             mark_missed(channel, level, above(place, wanted, level));
             here.entry = MISSING;

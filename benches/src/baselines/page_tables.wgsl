@@ -30,6 +30,6 @@ fn find(channel: u32, level: u32, depth: f32, ray: vec3f) -> Spot {
     if HIDES && here.entry >= FIRST_SLOT && is_range_hidden(channel, ranges[here.entry - FIRST_SLOT]) {
         here.entry = EMPTY;
     }
-    mark_used(here.entry);
+    mark_used(channel, here.entry);
     return here;
 }

@@ -4,6 +4,7 @@
 //   SLOTS     channels that are seen
 //   STACK     nodes of each channel that are remembered
 //   HIDES     page tables know what the transfer function hides
+//   EACH_SAMPLE  bricks are searched for at every sample, not only where one ends
 //
 // Bricks, their borders and their sampling are the product's, so that only the traversal differs.
 
@@ -108,10 +109,14 @@ fn leaving_box(level: u32, first: vec3u, edge: u32, ray: vec3f) -> f32 {
     return min(depths.x, min(depths.y, depths.z));
 }
 
-fn mark_used(entry: u32) {
-    if entry < FIRST_SLOT {
+// Per channel, the entry noted last: a ray notes a brick once for many samples.
+var<private> marked: array<u32, SLOTS>;
+
+fn mark_used(channel: u32, entry: u32) {
+    if entry < FIRST_SLOT || entry == marked[channel] {
         return;
     }
+    marked[channel] = entry;
     let slot = entry - FIRST_SLOT;
     let word = COUNTERS + slot / 32u;
     let bit = 1u << (slot % 32u);
@@ -219,6 +224,8 @@ fn trace(pixel: vec2u) -> vec3f {
     var level_end = -1.0;
     var segments = 0u;
     var misses = 0u;
+    // Channels that are drawn from here on, as bits.
+    var sampled = 0u;
     for (var c = 0u; c < SLOTS; c += 1u) {
         drawn_for[c] = MAX_LEVELS;
     }
@@ -240,9 +247,10 @@ fn trace(pixel: vec2u) -> vec3f {
         let first = min(step, end - start);
         let depth = start + 0.5 * first;
         var until = min(level_end + 0.5 * step, end + 0.5 * step);
-        var sampled = 0u;
+        let was_sampled = sampled != 0u;
+        sampled = 0u;
         for (var c = 0u; c < SLOTS; c += 1u) {
-            if wanted != drawn_for[c] || depth >= drawn[c].leaving {
+            if (EACH_SAMPLE && was_sampled) || wanted != drawn_for[c] || depth >= drawn[c].leaving {
                 drawn[c] = find(c, wanted, depth, ray);
                 drawn_for[c] = wanted;
                 misses += u32(drawn[c].entry == MISSING);
@@ -250,7 +258,8 @@ fn trace(pixel: vec2u) -> vec3f {
             until = min(until, drawn[c].leaving);
             sampled |= select(0u, 1u << c, drawn[c].entry >= FIRST_SLOT);
         }
-        let count = u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
+        let ahead_of_all = u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
+        let count = select(ahead_of_all, 1u, EACH_SAMPLE && sampled != 0u);
         for (var c = 0u; c < SLOTS; c += 1u) {
             if (sampled & (1u << c)) != 0u {
                 aim(c, depth, ray);

@@ -47,7 +47,7 @@ fn baseline(
     let volume = &formula.volume;
     let mut baseline = Baseline::new(gpu, volume, views, method, start_level, 64 << 20).unwrap();
     let work = baseline.settle(view, formula).unwrap();
-    baseline.frame_ms(view, 1).unwrap();
+    baseline.frames(view, 1).unwrap();
     (baseline.pixels(), work, baseline)
 }
 
@@ -117,7 +117,7 @@ fn baselines_differ_as_they_should() {
     };
     let scene = (&formula, &views[..]);
     let [tables, hiding, restart, stack] =
-        Method::ALL.map(|method| baseline(&gpu, scene, &view, method, u32::MAX).1);
+        Method::BY_BRICK.map(|method| baseline(&gpu, scene, &view, method, u32::MAX).1);
     assert_eq!(tables.rays, restart.rays);
     assert!(hiding.samples <= tables.samples && restart.samples <= hiding.samples);
     assert_eq!(restart.samples, stack.samples);
@@ -133,6 +133,18 @@ fn baselines_differ_as_they_should() {
         "octrees need the levels above as well"
     );
     assert_eq!(restart.bricks, stack.bricks);
+    // The same samples of the same bricks, with a search for each.
+    for (method, by_brick) in [
+        (Method::SampledPageTables, tables),
+        (Method::SampledOctree, stack),
+    ] {
+        let sampled = baseline(&gpu, scene, &view, method, u32::MAX).1;
+        assert_eq!(
+            (sampled.samples, sampled.bricks),
+            (by_brick.samples, by_brick.bricks)
+        );
+        assert!(sampled.work > 4 * by_brick.work, "{sampled:?}");
+    }
     // The last brick that is there is not enough.
     let mut few = Baseline::new(
         &gpu,

@@ -14,7 +14,7 @@ use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Volume};
 use saccade_render::{ChannelView, FrameReport, Gpu, Renderer, RendererOptions, View};
 
-use super::table_9_1::{Drawn, mean};
+use super::table_9_1::{Drawn, mean, time_of};
 use crate::baselines::{Baseline, Method, Work};
 use crate::bricks::{Bricks, ramp, settle_loading};
 use crate::plot::{Axis, Plot};
@@ -101,7 +101,24 @@ fn channel(transfer: TransferFunction) -> Vec<ChannelView> {
 
 /// A view that wants level `level`, a voxel a pixel, of a face of a volume.
 fn face(volume: &Volume, size: UVec2, level: u32) -> View {
-    let nm = volume.voxel_nm.min_element() * f64::from(level).exp2();
+    face_at(
+        volume,
+        size,
+        volume.voxel_nm.min_element() * f64::from(level).exp2(),
+    )
+}
+
+/// The same, with pixels as large as that level's voxels look from there, which are flat: each such view is drawn from another
+/// level.
+fn face_of(volume: &Volume, size: UVec2, level: u32) -> View {
+    let forward = face(volume, size, 0).camera.physical_from_eye_axes().z_axis;
+    let DVec3 { x, y, z } = volume.voxel_nm * volume.levels[level as usize].downsampling;
+    let shadow = forward.abs().dot(DVec3::new(y * z, z * x, x * y));
+    face_at(volume, size, shadow.sqrt())
+}
+
+/// A view of a face of a volume whose pixels are `nm` large.
+fn face_at(volume: &Volume, size: UVec2, nm: f64) -> View {
     let tangent = (Camera::FOV / 2.0).to_radians().tan();
     let extent = volume.size_nm();
     let camera = Camera {
@@ -117,6 +134,7 @@ fn face(volume: &Volume, size: UVec2, level: u32) -> View {
 fn picture(scale: Scale) -> UVec2 {
     match scale {
         Scale::Small => UVec2::new(96, 72),
+        Scale::Medium => UVec2::new(256, 192),
         Scale::Paper => UVec2::new(1024, 768),
     }
 }
@@ -125,7 +143,7 @@ fn picture(scale: Scale) -> UVec2 {
 fn cache_bytes(scale: Scale) -> u64 {
     match scale {
         Scale::Small => 320 << 20,
-        Scale::Paper => 1 << 30,
+        Scale::Medium | Scale::Paper => 1 << 30,
     }
 }
 
@@ -172,7 +190,11 @@ pub(crate) fn table_2(settings: &Settings) -> Result<Vec<Row>> {
                 let [ours, tree] = both(gpu, &tissue.volume, &tissue, &views, &view, scale)?;
                 (ours, tree, extent)
             } else {
-                let extent = UVec3::splat(if scale == Scale::Paper { 2048 } else { 256 });
+                let extent = UVec3::splat(match scale {
+                    Scale::Small => 256,
+                    Scale::Medium => 512,
+                    Scale::Paper => 2048,
+                });
                 let size = extent.as_dvec3();
                 let value = move |_, at: DVec3| plant(at / size, at);
                 let sensor = Formula::new(extent, DVec3::splat(1000.0), Dtype::Uint8, 1, value)?;
@@ -204,7 +226,18 @@ pub(crate) fn table_2(settings: &Settings) -> Result<Vec<Row>> {
                 format!("{} x {} x {} voxels", extent.x, extent.y, extent.z),
             )
             .setting("octree_fps", 1e3 / mean(&tree))
-            .setting("published octree_fps", published[1]);
+            .setting("time", time_of(gpu))
+            .setting("ours over the octree's", mean(&tree) / mean(&ours))
+            .setting("published octree_fps", published[1])
+            .setting(
+                "published ours over the octree's",
+                published[0] / published[1],
+            );
+            eprintln!(
+                "  {id}: {:.1} frames per second, octree {:.1}",
+                1e3 / mean(&ours),
+                1e3 / mean(&tree)
+            );
             rows.push(row);
         }
     }
@@ -287,7 +320,7 @@ pub(crate) fn figure_6(settings: &Settings) -> Result<Vec<Row>> {
     let (report, loaded) = settle_loading(&mut ours, &view, &tissue)?;
     let ours = entries(&report);
     let mut baselines = Vec::new();
-    for method in Method::ALL {
+    for method in Method::BY_BRICK {
         let bytes = cache_bytes(scale);
         let mut baseline = Baseline::new(gpu, &tissue.volume, &views, method, u32::MAX, bytes)?;
         let work = baseline.settle(&view, &tissue)?;
@@ -356,17 +389,27 @@ struct Frame {
     entries: [f64; 3],
     nodes: [f64; 3],
     restart: [f64; 3],
+    /// Bricks, page tables, blocks to construct; loaded for this frame.
     ours: [usize; 3],
+    /// The same of an octree: bricks, nodes, blocks.
     octree: [usize; 3],
 }
 
-/// Draws views one after another, with what was loaded before still there unless `afresh`.
+/// Whether views are drawn with what was loaded before still there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Caches {
+    Kept,
+    /// Each view finds nothing, so that what is loaded is all that it uses.
+    Emptied,
+}
+
+/// Draws views one after another.
 fn sequence(
     gpu: &Gpu,
     tissue: &Tissue,
     scale: Scale,
     views: &[(View, bool)],
-    afresh: bool,
+    caches: Caches,
 ) -> Result<Vec<Frame>> {
     let bytes = cache_bytes(scale);
     let new = |method| -> Result<Baseline> {
@@ -378,8 +421,8 @@ fn sequence(
     let mut restart = new(Method::KdRestart)?;
     let mut frames = Vec::new();
     let mut semi_transparent_before = None;
-    for (view, semi_transparent) in views {
-        if afresh {
+    for ((view, semi_transparent), number) in views.iter().zip(1..) {
+        if caches == Caches::Emptied {
             ours = renderer(gpu, &tissue.volume, scale)?;
             (octree, restart) = (new(Method::ShortStack)?, new(Method::KdRestart)?);
             semi_transparent_before = None;
@@ -398,13 +441,23 @@ fn sequence(
         let work = octree.settle(view, tissue)?;
         let of_restart = restart.settle(view, tissue)?;
         let theirs = &octree.loaded()[had..];
-        let tables = report.memory.tables_resident - tables;
+        let tables = report.memory.tables_resident.saturating_sub(tables);
+        eprintln!(
+            "  view {number} of {}: {} bricks, octree {}",
+            views.len(),
+            loaded.len(),
+            theirs.len()
+        );
         frames.push(Frame {
             entries: entries(&report),
             nodes: nodes(&work),
             restart: nodes(&of_restart),
             ours: [loaded.len(), tables as usize, constructed(&loaded)],
-            octree: [theirs.len(), octree.parts() - parts, constructed(theirs)],
+            octree: [
+                theirs.len(),
+                octree.parts().saturating_sub(parts),
+                constructed(theirs),
+            ],
         });
     }
     Ok(frames)
@@ -420,22 +473,24 @@ pub(crate) fn figure_7(settings: &Settings) -> Result<Vec<Row>> {
     let coarsest = u32::try_from(tissue.volume.levels.len() - 1)?;
     let zoom: Vec<_> = (0..=coarsest)
         .rev()
-        .map(|level| (face(&tissue.volume, size, level), false))
+        .map(|level| (face_of(&tissue.volume, size, level), false))
         .collect();
-    let levels = sequence(gpu, &tissue, scale, &zoom, true)?;
-    let mut animation = zoom.clone();
+    let levels = sequence(gpu, &tissue, scale, &zoom, Caches::Emptied)?;
+    let mut pan = Vec::new();
     let near = zoom[zoom.len() - 1].0;
     for frame in 12..=30_u32 {
         let by = f64::from(frame.min(27) - 11) * f64::from(size.x) / 16.0;
         let camera = near
             .camera
             .panned(DVec2::new(-by, 0.3 * by), f64::from(size.y));
-        animation.push((View { camera, ..near }, frame >= 18));
+        pan.push((View { camera, ..near }, frame >= 18));
     }
-    let frames = sequence(gpu, &tissue, scale, &animation, false)?;
-    plots(settings, coarsest, &levels, &frames)?;
-    let total = |of: fn(&Frame) -> usize| frames.iter().map(of).sum::<usize>() as f64;
-    let finest = levels.last().map(|f| f.entries).unwrap_or_default();
+    let animation = [&zoom[..], &pan].concat();
+    let frames = sequence(gpu, &tissue, scale, &animation, Caches::Kept)?;
+    let mut whole = levels.clone();
+    whole.extend(sequence(gpu, &tissue, scale, &pan, Caches::Emptied)?);
+    plots(settings, coarsest, &levels, &frames, &whole)?;
+    let finest = levels.last().cloned().unwrap_or_default();
     let row = |id, unit, value: f64| {
         let mut row = Row::new(id, unit, vec![value])
             .setting("picture", format!("{}x{}", size.x, size.y))
@@ -443,49 +498,79 @@ pub(crate) fn figure_7(settings: &Settings) -> Result<Vec<Row>> {
                 "volume",
                 format!("{} x {} x {} voxels, tissue", CORTEX.x, CORTEX.y, CORTEX.z),
             );
-        for (frame, number) in frames.iter().zip(1..) {
+        for ((frame, whole), number) in frames.iter().zip(&whole).zip(1..) {
             let Frame { ours, octree, .. } = frame;
             let text = format!(
-                "entries {}, kd-restart {}, kd-shortstack {}; new bricks {} and {}, tables {} and nodes {}, blocks {} and {}",
+                "entries {}, kd-restart {}, kd-shortstack {}; new bricks {} of {} and {} of {}, tables {} of {} and nodes {} of {}, blocks {} of {} and {} of {}",
                 told(frame.entries),
                 told(frame.restart),
                 told(frame.nodes),
                 ours[0],
+                whole.ours[0],
                 octree[0],
+                whole.octree[0],
                 ours[1],
+                whole.ours[1],
                 octree[1],
+                whole.octree[1],
                 ours[2],
-                octree[2]
+                whole.ours[2],
+                octree[2],
+                whole.octree[2],
             );
             row = row.setting(&format!("frame {number:02}"), text);
         }
         row
     };
+    let over = |id, unit, of: fn(&Frame) -> [usize; 2]| {
+        let [ours, theirs] = of(&finest);
+        Row::new(
+            id,
+            unit,
+            vec![total_of(&frames, of)[1] / total_of(&frames, of)[0].max(1.0)],
+        )
+        .setting(
+            "of the view of level 0 alone",
+            format!("{theirs} over {ours}"),
+        )
+    };
     Ok(vec![
-        row(FIGURE_7_IDS[0], "entries a ray at level 0, mean", finest[1])
+        row(FIGURE_7_IDS[0], "entries a ray at level 0, mean", finest.entries[1])
             .peer(2.9, "Hadwiger et al. 2012, fig. 6 and 7 a"),
-        Row::new(
-            FIGURE_7_IDS[1],
-            "octree's over ours, thirty frames",
-            vec![total(|f| f.octree[0]) / total(|f| f.ours[0])],
-        ),
-        Row::new(
-            FIGURE_7_IDS[2],
-            "octree's over ours, thirty frames",
-            vec![total(|f| f.octree[2]) / total(|f| f.ours[2])],
-        ),
-        Row::new(
+        over(FIGURE_7_IDS[1], "octree's bricks over ours, thirty frames", |f| {
+            [f.ours[0], f.octree[0]]
+        })
+        .peer(2768.0 / 2146.0, "Hadwiger et al. 2012, section 8.1.3: the view of level 0 alone"),
+        over(FIGURE_7_IDS[2], "octree's 3D blocks over ours, thirty frames", |f| {
+            [f.ours[2], f.octree[2]]
+        })
+        .peer(36.0 / 18.0, "Hadwiger et al. 2012, section 8.1.3: the view of level 0 alone"),
+        over(
             FIGURE_7_IDS[3],
-            "octree's nodes over our page table blocks",
-            vec![total(|f| f.octree[1]) / total(|f| f.ours[1]).max(1.0)],
-        ),
+            "octree's nodes over our page table blocks, thirty frames",
+            |f| [f.ours[1], f.octree[1]],
+        )
+        .peer(1250.0, "Hadwiger et al. 2012, section 8.1.3: 5,000 nodes over 1 to 4 blocks, the view of level 0 alone"),
     ])
+}
+
+/// Sums over frames, of ours and of theirs.
+fn total_of(frames: &[Frame], of: fn(&Frame) -> [usize; 2]) -> [f64; 2] {
+    let pairs = frames.iter().map(of);
+    let sums = pairs.fold([0, 0], |[a, b], [c, d]| [a + c, b + d]);
+    sums.map(|sum| sum as f64)
 }
 
 /// A number of a frame.
 type Of<'a> = &'a dyn Fn(&Frame) -> f64;
 
-fn plots(settings: &Settings, coarsest: u32, levels: &[Frame], frames: &[Frame]) -> Result<()> {
+fn plots(
+    settings: &Settings,
+    coarsest: u32,
+    levels: &[Frame],
+    frames: &[Frame],
+    whole: &[Frame],
+) -> Result<()> {
     let by_level = |of: Of<'_>| -> Vec<[f64; 2]> {
         let levels = levels.iter().zip((0..=coarsest).rev());
         levels
@@ -504,30 +589,47 @@ fn plots(settings: &Settings, coarsest: u32, levels: &[Frame], frames: &[Frame])
             .dashed(&format!("kd-restart, {name}"), by_level(&|f| f.restart[k]));
     }
     settings.plot(&plot, "fig_7a")?;
-    let loaded = |title: &str, x: &str, points: &dyn Fn(Of<'_>) -> Vec<[f64; 2]>| {
-        let mut plot = Plot::new(title, x, "new, log", Axis::Logarithmic);
-        let names = [
-            ("bricks", "bricks"),
-            ("page tables", "nodes"),
-            ("3D blocks", "3D blocks"),
-        ];
-        for (k, (ours, theirs)) in names.into_iter().enumerate() {
-            plot = plot.line(ours, points(&|f| f.ours[k] as f64)).dashed(
-                &format!("octree: {theirs}"),
-                points(&|f| f.octree[k] as f64),
-            );
-        }
-        plot
-    };
-    let title = "Loaded for a view, by level, after fig. 7 b";
-    settings.plot(&loaded(title, "level of the view", &by_level), "fig_7b")?;
-    let by_frame = |of: Of<'_>| -> Vec<[f64; 2]> {
+    let mut plot = Plot::new(
+        "Loaded for a view, by level, after fig. 7 b",
+        "level of the view",
+        "loaded, log",
+        Axis::Logarithmic,
+    );
+    let names = [
+        ("bricks", "bricks"),
+        ("page tables", "nodes"),
+        ("3D blocks", "3D blocks"),
+    ];
+    for (k, (ours, theirs)) in names.into_iter().enumerate() {
+        plot = plot.line(ours, by_level(&|f| f.ours[k] as f64)).dashed(
+            &format!("octree: {theirs}"),
+            by_level(&|f| f.octree[k] as f64),
+        );
+    }
+    settings.plot(&plot, "fig_7b")?;
+    let by_frame = |frames: &[Frame], of: Of<'_>| -> Vec<[f64; 2]> {
         let frames = frames.iter().zip(1..);
         frames
             .map(|(frame, number)| [f64::from(number), of(frame)])
             .collect()
     };
-    let title = "Loaded while moving, after fig. 7 c, d";
     let x = "frame: zoom to 11, pan to 27, transparent from 18";
-    settings.plot(&loaded(title, x, &by_frame), "fig_7cd")
+    let ours = |frames: &[Frame], k: usize| by_frame(frames, &|f| f.ours[k] as f64);
+    let theirs = |frames: &[Frame], k: usize| by_frame(frames, &|f| f.octree[k] as f64);
+    let title = "3D blocks, after fig. 7 c";
+    let plot = Plot::new(title, x, "3D blocks", Axis::Linear)
+        .line("new", ours(frames, 2))
+        .line("in use", ours(whole, 2))
+        .dashed("octree: new", theirs(frames, 2))
+        .dashed("octree: in use", theirs(whole, 2));
+    settings.plot(&plot, "fig_7c")?;
+    let title = "Bricks, page tables, nodes, after fig. 7 d";
+    let plot = Plot::new(title, x, "log", Axis::Logarithmic)
+        .line("bricks, new", ours(frames, 0))
+        .line("bricks, in use", ours(whole, 0))
+        .line("page tables, new", ours(frames, 1))
+        .line("page tables, in use", ours(whole, 1))
+        .dashed("octree: nodes, new", theirs(frames, 1))
+        .dashed("octree: nodes, in use", theirs(whole, 1));
+    settings.plot(&plot, "fig_7d")
 }

@@ -4,11 +4,12 @@
 use anyhow::{Result, ensure};
 use glam::{UVec2, UVec3};
 use saccade_core::camera::Camera;
-use saccade_render::{Gpu, Renderer, RendererOptions, Statistics, View};
+use saccade_render::{Gpu, Renderer, RendererOptions, Statistics, View, wgpu};
 
 use crate::baselines::{Baseline, Method, Work};
 use crate::bricks::settle;
 use crate::clock::Stopwatch;
+use crate::cpu;
 use crate::plot::{Axis, Plot};
 use crate::report::Row;
 use crate::settings::Settings;
@@ -17,22 +18,40 @@ use crate::volumes::{Case, DataSet, Scale};
 pub(crate) const IDS: &[&str] = &[
     "render.aneurism_1ch.vs_page_tables",
     "render.aneurism_1ch.vs_octree",
+    "render.aneurism_1ch.vs_sampled_page_tables",
+    "render.aneurism_1ch.vs_sampled_octree",
     "render.aneurism_4ch.vs_page_tables",
     "render.aneurism_4ch.vs_octree",
+    "render.aneurism_4ch.vs_sampled_page_tables",
+    "render.aneurism_4ch.vs_sampled_octree",
     "render.bonsai_1ch.vs_page_tables",
     "render.bonsai_1ch.vs_octree",
+    "render.bonsai_1ch.vs_sampled_page_tables",
+    "render.bonsai_1ch.vs_sampled_octree",
     "render.bonsai_4ch.vs_page_tables",
     "render.bonsai_4ch.vs_octree",
+    "render.bonsai_4ch.vs_sampled_page_tables",
+    "render.bonsai_4ch.vs_sampled_octree",
     "render.kingsnake_1ch.vs_page_tables",
     "render.kingsnake_1ch.vs_octree",
+    "render.kingsnake_1ch.vs_sampled_page_tables",
+    "render.kingsnake_1ch.vs_sampled_octree",
     "render.kingsnake_4ch.vs_page_tables",
     "render.kingsnake_4ch.vs_octree",
+    "render.kingsnake_4ch.vs_sampled_page_tables",
+    "render.kingsnake_4ch.vs_sampled_octree",
     "render.cycif_16ch.vs_page_tables",
     "render.cycif_16ch.vs_octree",
+    "render.cycif_16ch.vs_sampled_page_tables",
+    "render.cycif_16ch.vs_sampled_octree",
     "render.cycif_medium_15ch.vs_page_tables",
     "render.cycif_medium_15ch.vs_octree",
+    "render.cycif_medium_15ch.vs_sampled_page_tables",
+    "render.cycif_medium_15ch.vs_sampled_octree",
     "render.cycif_large_4ch.vs_page_tables",
     "render.cycif_large_4ch.vs_octree",
+    "render.cycif_large_4ch.vs_sampled_page_tables",
+    "render.cycif_large_4ch.vs_sampled_octree",
 ];
 
 pub(crate) const LEAF_IDS: &[&str] = &[
@@ -59,6 +78,7 @@ const TABLE: [Cells; 9] = [
 fn cache_bytes(scale: Scale) -> u64 {
     match scale {
         Scale::Small => 256 << 20,
+        Scale::Medium => 1 << 30,
         Scale::Paper => 12 << 30,
     }
 }
@@ -70,6 +90,30 @@ const BATCH_MS: f64 = 40.0;
 pub(crate) enum Drawn {
     Ours(Box<Renderer>),
     Baseline(Box<Baseline>),
+}
+
+/// Time of what a closure does; of all threads' processors where these draw, which others on the machine disturb less.
+fn spent(is_cpu: bool, draw: impl FnOnce() -> Result<()>) -> Result<f64> {
+    let (start, before) = (Stopwatch::start(), cpu::of_threads()?);
+    draw()?;
+    let spent = match is_cpu {
+        true => cpu::of_threads()?.saturating_sub(before),
+        false => start.elapsed(),
+    };
+    Ok(spent.as_secs_f64() * 1e3)
+}
+
+/// Which time frames took.
+pub(crate) fn time_of(gpu: &Gpu) -> &'static str {
+    match is_cpu(gpu) {
+        true => "of all threads' processors",
+        false => "from asking for frames until they are drawn",
+    }
+}
+
+/// Whether a device draws on the CPU.
+pub(crate) fn is_cpu(gpu: &Gpu) -> bool {
+    gpu.adapter().device_type == wgpu::DeviceType::Cpu
 }
 
 impl Drawn {
@@ -86,17 +130,19 @@ impl Drawn {
     }
 
     fn frames_ms(&mut self, view: &View, frames: u32) -> Result<f64> {
-        match self {
-            Self::Ours(renderer) => {
-                let start = Stopwatch::start();
+        let ms = match self {
+            Self::Ours(renderer) => spent(is_cpu(renderer.gpu()), || {
                 for _ in 0..frames {
                     renderer.render(view);
                 }
                 pollster::block_on(renderer.finish());
-                Ok(start.elapsed().as_secs_f64() * 1e3 / f64::from(frames))
+                Ok(())
+            })?,
+            Self::Baseline(baseline) => {
+                spent(is_cpu(baseline.gpu()), || baseline.frames(view, frames))?
             }
-            Self::Baseline(baseline) => baseline.frame_ms(view, frames),
-        }
+        };
+        Ok(ms / f64::from(frames))
     }
 }
 
@@ -146,6 +192,7 @@ fn baseline(
 fn views(case: &Case, scale: Scale) -> Vec<View> {
     let (count, size) = match scale {
         Scale::Small => (1, UVec2::new(80, 60)),
+        Scale::Medium => (2, UVec2::new(160, 120)),
         Scale::Paper => (8, UVec2::new(1024, 768)),
     };
     let camera = Camera::around(&case.formula.volume).zoomed(1.3);
@@ -161,7 +208,7 @@ fn views(case: &Case, scale: Scale) -> Vec<View> {
 
 /// Times of each \[ms\], one per view and run, measured in turn.
 fn times(drawn: &mut [Drawn], views: &[View]) -> Result<Vec<Vec<f64>>> {
-    const RUNS: usize = 3;
+    const RUNS: usize = 5;
     let mut times = vec![Vec::new(); drawn.len()];
     for _ in 0..RUNS {
         for view in views {
@@ -187,10 +234,11 @@ pub(crate) fn measure(settings: &Settings) -> Result<Vec<Row>> {
     let gpu = &pollster::block_on(Gpu::headless())?;
     let scale = settings.scale(gpu);
     let mut rows = Vec::new();
-    for ((set, channels, published), ids) in TABLE.into_iter().zip(IDS.chunks(2)) {
+    for ((set, channels, published), ids) in TABLE.into_iter().zip(IDS.chunks(4)) {
         if !ids.iter().any(|id| settings.wants(id)) {
             continue;
         }
+        eprintln!("  {set:?}, {channels} channels ...");
         let case = set.case(scale, channels)?;
         let views = views(&case, scale);
         let (ours, statistics) = ours(gpu, &case, &views, scale, None)?;
@@ -202,11 +250,20 @@ pub(crate) fn measure(settings: &Settings) -> Result<Vec<Row>> {
             works.push(work);
         }
         let times = times(&mut drawn, &views)?;
-        let [ours, tables, hiding, restart, stack] = &times[..] else {
-            unreachable!("ours and four baselines");
+        let [
+            ours,
+            tables,
+            hiding,
+            restart,
+            stack,
+            sampled_tables,
+            sampled_octree,
+        ] = &times[..]
+        else {
+            unreachable!("ours and six baselines");
         };
         let extent = case.formula.volume.extent();
-        let row = |id, theirs: &[f64], published: f64| {
+        let row = |id, theirs: &[f64], published: f64, work: &Work| {
             Row::new(id, "theirs over ours", ratios(theirs, ours))
                 .peer(published, "Herzberger 2023, table 9.1, GTX 1080")
                 .setting(
@@ -218,36 +275,52 @@ pub(crate) fn measure(settings: &Settings) -> Result<Vec<Row>> {
                     format!("{} x {} x {} voxels", extent.x, extent.y, extent.z),
                 )
                 .setting("channels", channels)
+                .setting("time", time_of(gpu))
                 .setting("views", views.len())
                 .setting("ours_ms", mean(ours))
                 .setting("theirs_ms", mean(theirs))
                 .setting("ours samples", statistics.samples)
                 .setting("ours bricks", statistics.bricks_used)
+                .setting("theirs samples", work.samples)
+                .setting("theirs bricks", work.bricks)
         };
         let [pt, octree, residency] = published;
+        let (pt, octree) = (pt / residency, octree / residency);
         rows.push(
-            row(ids[0], tables, pt / residency)
+            row(ids[0], tables, pt, &works[0])
                 .setting("theirs", "page tables that skip bricks of zeros")
-                .setting("theirs samples", works[0].samples)
-                .setting("theirs bricks", works[0].bricks)
                 .setting(
                     "skipping what is hidden too, over ours",
                     mean(hiding) / mean(ours),
                 ),
         );
         rows.push(
-            row(ids[1], stack, octree / residency)
+            row(ids[1], stack, octree, &works[3])
                 .setting("theirs", "an octree of bricks, four nodes remembered")
-                .setting("theirs samples", works[3].samples)
-                .setting("theirs bricks", works[3].bricks)
                 .setting(
                     "entered at the top each time, over ours",
                     mean(restart) / mean(ours),
                 ),
         );
+        rows.push(row(ids[2], sampled_tables, pt, &works[4]).setting(
+            "theirs",
+            "page tables that skip bricks of zeros, looked up at every sample, as published",
+        ));
+        rows.push(row(ids[3], sampled_octree, octree, &works[5]).setting(
+            "theirs",
+            "an octree of bricks, searched at every sample of every channel, as published",
+        ));
     }
     Ok(rows)
 }
+
+/// What leaf sizes are drawn beside.
+const BESIDE: [(&str, Method); 4] = [
+    ("page tables", Method::PageTables),
+    ("octree", Method::ShortStack),
+    ("page tables, published", Method::SampledPageTables),
+    ("octree, published", Method::SampledOctree),
+];
 
 /// Leaf sizes and channels \[001 fig. 9.2, 9.3\]: times by channel, as plots; the row is the gain of the smallest
 /// leaves with the most channels.
@@ -270,16 +343,18 @@ pub(crate) fn leaf_sizes(settings: &Settings) -> Result<Vec<Row>> {
         }
         let counts: &[u32] = match scale {
             Scale::Small => &[1, 4],
+            Scale::Medium => &[1, 2, 4, 8, most],
             Scale::Paper => &[1, 2, 3, 4, 6, 8, 10, 12, most],
         };
         let names: Vec<_> = leaves
             .iter()
             .map(|(name, _)| format!("leaves {name}"))
-            .chain(["page tables", "octree"].map(str::to_owned))
+            .chain(BESIDE.map(|(name, _)| name.to_owned()))
             .collect();
         let mut lines = vec![Vec::new(); names.len()];
         let mut gain = Vec::new();
         for &channels in counts {
+            eprintln!("  {set:?}, {channels} channels ...");
             let case = set.case(scale, channels)?;
             let views = views(&case, scale);
             let views = &views[..views.len().min(2)];
@@ -287,7 +362,7 @@ pub(crate) fn leaf_sizes(settings: &Settings) -> Result<Vec<Row>> {
             for (_, leaf) in leaves {
                 drawn.push(ours(gpu, &case, views, scale, Some(leaf))?.0);
             }
-            for method in [Method::PageTables, Method::ShortStack] {
+            for (_, method) in BESIDE {
                 drawn.push(baseline(gpu, &case, views, scale, method)?.0);
             }
             let times = times(&mut drawn, views)?;
@@ -301,10 +376,11 @@ pub(crate) fn leaf_sizes(settings: &Settings) -> Result<Vec<Row>> {
             figure.replace('_', ".")
         );
         let mut plot = Plot::new(&title, "visible channels", "ms a frame", Axis::Linear);
-        for (name, line) in names.iter().zip(&lines) {
-            plot = match name.as_str() {
-                "page tables" | "octree" => plot.dashed(name, line.iter().copied()),
-                _ => plot.line(name, line.iter().copied()),
+        for (index, (name, line)) in names.iter().zip(&lines).enumerate() {
+            plot = if index < leaves.len() {
+                plot.line(name, line.iter().copied())
+            } else {
+                plot.dashed(name, line.iter().copied())
             };
         }
         settings.plot(&plot, &format!("fig_{figure}"))?;
