@@ -96,7 +96,7 @@ mod tests {
             std::thread::sleep(Duration::from_millis(1));
         }
         assert!(of_thread().unwrap() < Duration::from_secs(5));
-        drop(stop.send(()));
+        stop.send(()).unwrap();
         busy.join().unwrap();
     }
 

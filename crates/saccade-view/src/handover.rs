@@ -80,7 +80,8 @@ impl Handover {
     }
 }
 
-#[cfg(all(test, target_os = "linux"))]
+#[cfg(test)]
+#[cfg(target_os = "linux")]
 impl Shown {
     pub(crate) fn app_mut(&mut self) -> &mut App {
         self.app.as_mut().expect("there until it is dropped")

@@ -128,7 +128,7 @@ impl Windows {
 
     /// Opens windows until one is closed. `around` is what is put around the application in each.
     fn run<'a>(
-        &'a self,
+        &self,
         options: impl Fn() -> eframe::NativeOptions,
         around: impl Fn(Shown) -> Box<dyn eframe::App + 'a>,
     ) -> Result<(), ViewError> {
@@ -211,5 +211,6 @@ fn view_error(error: eframe::Error) -> ViewError {
     }
 }
 
-#[cfg(all(test, target_os = "linux"))]
+#[cfg(test)]
+#[cfg(target_os = "linux")]
 mod tests;

@@ -128,13 +128,12 @@ fn look(losses: u32) -> (Result<(), ViewError>, Seen) {
     };
     let windows = Windows::new(source.clone(), None, options);
     let seen = RefCell::new(Seen::default());
-    let native = || {
-        let mut native = eframe::NativeOptions::default();
-        native.event_loop_builder = Some(Box::new(|builder| {
+    let native = || eframe::NativeOptions {
+        event_loop_builder: Some(Box::new(|builder| {
             use winit::platform::x11::EventLoopBuilderExtX11 as _;
             builder.with_any_thread(true);
-        }));
-        native
+        })),
+        ..eframe::NativeOptions::default()
     };
     let result = windows.run(native, |shown| {
         seen.borrow_mut().windows += 1;
@@ -182,6 +181,7 @@ async fn on_a_display() {
 }
 
 #[test]
+#[expect(clippy::print_stderr, reason = "why a test was left out")]
 fn a_window_whose_device_is_lost_comes_back_with_its_picture() {
     let wanted = std::env::var("SACCADE_WINDOW_TESTS").is_ok_and(|v| v == "require");
     let server = Command::new("Xvfb")
