@@ -39,7 +39,7 @@ pub type Wake = Arc<dyn Fn() + Send + Sync>;
 /// What a session may use.
 #[derive(Clone)]
 pub struct SessionOptions {
-    /// Ceiling for GPU memory \[bytes\].
+    /// Ceiling for GPU memory \[bytes\]. An eighth of it is kept for the picture and for bricks on their way.
     pub gpu_bytes: u64,
     /// What the pull may take; [`Limits::host_bytes`] is the ceiling for main memory.
     pub limits: Limits,
@@ -198,16 +198,27 @@ fn poll_after(frame_time: Option<Duration>) -> Duration {
     quarter.clamp(Duration::from_millis(4), Duration::from_millis(50))
 }
 
+/// Share of the GPU's ceiling that is kept for the picture and for bricks on their way to it.
+const KEPT_SHARE: u64 = 8;
+
 fn renderer(gpu: &Gpu, volume: &Arc<Volume>, bytes: u64) -> Result<Renderer, SessionError> {
     // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn.
     let software = gpu.adapter().device_type == DeviceType::Cpu;
+    let kept = bytes / KEPT_SHARE;
     let options = RendererOptions {
-        memory_bytes: bytes,
+        memory_bytes: bytes - kept,
         bands: if software { 4 } else { 1 },
         ..RendererOptions::default()
     };
     Renderer::new(gpu, volume.clone(), options).map_err(|source| SessionError::Renderer {
-        source,
+        source: match source {
+            // Of the whole ceiling.
+            RendererError::Ceiling { needed, .. } => RendererError::Ceiling {
+                ceiling: bytes,
+                needed: needed + needed / (KEPT_SHARE - 1) + 1,
+            },
+            other => other,
+        },
         name: volume.name.clone(),
     })
 }
