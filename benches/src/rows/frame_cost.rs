@@ -95,7 +95,7 @@ pub(crate) fn octree() -> Result<Vec<Row>> {
             .setting(&name("µs a brick"), told(&with.per_brick))
             .setting(&name("of it for the octree"), told(&of_octree))
             .setting(
-                &name("longest frame after 4096 bricks at once, and one without, ms"),
+                &name("longest frame after 2048 bricks at once, and one without, ms"),
                 format!("{:.2}, {:.2}", with.burst_ms, with.idle_us / 1e3),
             )
             .with_runs(vec![with.per_brick[2]]);
