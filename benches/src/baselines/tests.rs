@@ -139,10 +139,10 @@ fn baselines_differ_as_they_should() {
         (Method::SampledOctree, stack),
     ] {
         let sampled = baseline(&gpu, scene, &view, method, u32::MAX).1;
-        assert_eq!(
-            (sampled.samples, sampled.bricks),
-            (by_brick.samples, by_brick.bricks)
-        );
+        assert_eq!(sampled.bricks, by_brick.bricks);
+        // A sample between two bricks may be either's, by the last digit.
+        let differ = sampled.samples.abs_diff(by_brick.samples);
+        assert!(differ < by_brick.samples / 1000, "{sampled:?}");
         assert!(sampled.work > 4 * by_brick.work, "{sampled:?}");
     }
     // The last brick that is there is not enough.
