@@ -23,7 +23,7 @@ pub struct Limits {
 impl Limits {
     /// The usual ones.
     pub const DEFAULT: Self = Self {
-        connections: 4096,
+        connections: 16_384,
         requests: 512,
         streams: 1024,
         head: Duration::from_secs(30),
