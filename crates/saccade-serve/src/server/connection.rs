@@ -13,7 +13,8 @@ use std::task::{Context, Poll};
 use axum::Router;
 use axum::body::{Body, Bytes, HttpBody};
 use axum::extract::ConnectInfo;
-use axum::http::Request;
+use axum::http::header::CONNECTION;
+use axum::http::{HeaderValue, Request};
 use axum::response::Response;
 use hyper::body::{Frame, Incoming, SizeHint};
 use hyper::server::conn::http1;
@@ -97,10 +98,19 @@ impl Connection {
             let (place, flow) = (place.clone(), flow.clone());
             service_fn(move |mut request: Request<Incoming>| {
                 let kept = (place.answering(), flow.answer());
+                // Nothing here takes one: it is not read, and what follows it is not taken for a request.
+                let has_body = !request.body().is_end_stream();
+                if has_body {
+                    flow.body_comes();
+                }
                 request.extensions_mut().insert(ConnectInfo(peer));
                 let response = service.call(request);
                 async move {
-                    let response: Response = response.await?;
+                    let mut response: Response = response.await?;
+                    if has_body {
+                        let close = HeaderValue::from_static("close");
+                        response.headers_mut().insert(CONNECTION, close);
+                    }
                     Ok::<_, Infallible>(response.map(|body| Answer { body, _kept: kept }))
                 }
             })

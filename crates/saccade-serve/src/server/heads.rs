@@ -47,6 +47,11 @@ impl Held {
         self.whole == 0 && !self.bytes.is_empty()
     }
 
+    /// Holds nothing back: it is no head.
+    fn release(&mut self) {
+        self.whole = self.bytes.len();
+    }
+
     /// Moves whole heads to a buffer, as far as it has room.
     fn give(&mut self, buffer: &mut ReadBuf<'_>) {
         let count = self.whole.min(buffer.remaining());
@@ -108,6 +113,8 @@ struct State {
     is_full: bool,
     /// Whether the next head has begun.
     has_begun: bool,
+    /// Whether a request came with a body: what follows is no head, and the connection ends with the answer.
+    has_body: bool,
     /// Who reads on once answers are sent.
     reader: Option<Waker>,
     /// When it last took something.
@@ -129,7 +136,12 @@ impl Flow {
     /// Whether there is nothing to do until the rest of a head comes.
     pub(super) fn waits(&self) -> bool {
         let state = self.state();
-        state.has_begun && state.under_way == 0 && !state.is_full
+        state.has_begun && !state.has_body && state.under_way == 0 && !state.is_full
+    }
+
+    /// Notes that what comes from now on is a body.
+    pub(super) fn body_comes(&self) {
+        self.state().has_body = true;
     }
 
     /// When the last answer was taken; when it began, if there was none.
@@ -169,6 +181,7 @@ impl<S> Heads<S> {
             under_way: 0,
             is_full: false,
             has_begun: false,
+            has_body: false,
             reader: None,
             written: Instant::now(),
         };
@@ -206,6 +219,10 @@ impl<S: AsyncRead + Unpin> AsyncRead for Heads<S> {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let this = &mut *self;
+        let has_body = this.flow.state().has_body;
+        if has_body {
+            this.held.release();
+        }
         while this.held.whole == 0 {
             if this.held.is_partial() {
                 let mut state = this.flow.state();
@@ -223,6 +240,9 @@ impl<S: AsyncRead + Unpin> AsyncRead for Heads<S> {
                 return Poll::Ready(Ok(()));
             }
             this.held.add(read.filled());
+            if has_body {
+                this.held.release();
+            }
         }
         this.held.give(buffer);
         this.flow.state().has_begun = this.held.is_partial();

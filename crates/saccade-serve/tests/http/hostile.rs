@@ -188,17 +188,23 @@ fn a_body_that_nobody_asked_for_is_not_read() {
     run(async {
         let served = serve(Options::DEFAULT).await;
         for method in ["GET", "POST"] {
-            let mut stream = connect(&served.url).await;
             let head = format!(
-                "{method} /volumes.json HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\nx"
+                "{method} /volumes.json HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000000\r\n\r\n"
             );
-            stream.write_all(head.as_bytes()).await.unwrap();
-            let answer = timeout(Duration::from_secs(5), rest(&mut stream)).await;
-            assert!(
-                answer
-                    .expect("the body is waited for")
-                    .starts_with("HTTP/1.1 ")
-            );
+            // What follows a head is a body, also where it looks like the next request.
+            for body in [
+                "",
+                "x",
+                "GET /volumes.json HTTP/1.1\r\nHost: localhost\r\n\r\n",
+            ] {
+                let mut stream = connect(&served.url).await;
+                stream.write_all(head.as_bytes()).await.unwrap();
+                stream.write_all(body.as_bytes()).await.unwrap();
+                let answer = timeout(Duration::from_secs(5), rest(&mut stream)).await;
+                let answer = answer.expect("the body is waited for");
+                assert!(answer.starts_with("HTTP/1.1 "), "{answer}");
+                assert_eq!(answer.matches("HTTP/1.1 ").count(), 1, "{answer}");
+            }
         }
     });
 }
