@@ -95,18 +95,19 @@ fn murmur(key: u64) -> u64 {
     u64::from(h[1]) << 32 | u64::from(h[0])
 }
 
+/// No shard is longer \[bytes\]: an empty minishard that is said to lie behind that is damage, not absence.
+const LONGEST: u64 = 1 << 48;
+
 /// Bytes of a minishard's index within its shard, from its entry of the shard's index; `None` if it is empty.
 pub(super) fn index_range(entry: &[u8], sharding: &Sharding) -> Result<Option<Range<u64>>, Damage> {
     let [start, end] = *entry.as_chunks::<8>().0 else {
         return Err("its index is too short".to_owned());
     };
     let (start, end) = (u64::from_le_bytes(start), u64::from_le_bytes(end));
-    if start == end {
-        return Ok(None);
-    }
     let base = sharding.index_bytes();
     let range = base.checked_add(start).zip(base.checked_add(end));
     match range {
+        Some((start, end)) if start == end && end <= LONGEST => Ok(None),
         Some((start, end)) if start < end && end - start <= MOST_INDEX => Ok(Some(start..end)),
         _ => Err(format!(
             "its index says bytes {start} to {end}, which cannot be"
@@ -221,6 +222,8 @@ mod tests {
         assert_eq!((entry(3, 3), entry(3, 9)), (Ok(None), Ok(Some(35..41))));
         assert!(
             entry(9, 3).is_err()
+                && entry(0xaaaa_aaaa_aaaa_aaaa, 0xaaaa_aaaa_aaaa_aaaa).is_err()
+                && entry(u64::MAX, u64::MAX).is_err()
                 && entry(0, u64::MAX).is_err()
                 && index_range(&[1], &sharding).is_err()
         );
