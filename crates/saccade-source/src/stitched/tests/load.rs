@@ -162,8 +162,8 @@ fn requests_that_are_dropped_end_their_reads() {
             source.read(chunk(level, block)).await.unwrap();
             assert_eq!(source.statistics().blocks_built, 1);
         }
-        // Each case had one; how many more the threads began is the scheduler's, but none would prove little.
-        assert!(dropped > 5, "{dropped} reads were under way");
+        // One in each case at least; how many more the threads had begun is the scheduler's.
+        assert!(dropped >= 5, "{dropped} reads were under way");
     });
 }
 
