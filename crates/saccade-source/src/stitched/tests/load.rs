@@ -149,9 +149,12 @@ fn requests_that_are_dropped_end_their_reads() {
             let stuck = std::pin::pin!(turnstile.settles(|t| t.waiting() > 0));
             match select(read, stuck).await {
                 Either::Left(_) => panic!("{answered} reads were enough"),
-                Either::Right(((), read)) => drop(read),
+                Either::Right(((), read)) => {
+                    // Before they end, which they may do at once.
+                    dropped += turnstile.waiting();
+                    drop(read);
+                }
             }
-            dropped += turnstile.waiting();
             // Nobody lets them through.
             turnstile.settles(|t| t.waiting() == 0).await;
             let asked = turnstile.asked();
@@ -162,8 +165,8 @@ fn requests_that_are_dropped_end_their_reads() {
             source.read(chunk(level, block)).await.unwrap();
             assert_eq!(source.statistics().blocks_built, 1);
         }
-        // One in each case at least; how many more the threads had begun is the scheduler's.
-        assert!(dropped >= 5, "{dropped} reads were under way");
+        // So many that ending one of them only would be noticed.
+        assert!(dropped >= 10, "{dropped} reads were under way");
     });
 }
 
