@@ -26,7 +26,8 @@ def get(path):
 
 name = get("volumes.json")["volumes"][0]["name"]
 path = f"v/{quote(name, safe='')}"
-volume = get(f"{path}/volume.json")["volume"]
+described = get(f"{path}/volume.json")
+volume = described["volume"]
 status = get(f"{path}/status.json")
 print(f"{name}: {' x '.join(map(str, volume['levels'][0]['extent']))} voxels of "
       f"{' x '.join(map(str, volume['voxel_nm']))} nm, {status['tiles']} tiles in {status['sections']} sections")
@@ -51,7 +52,7 @@ print(f"the middle: {region.shape} voxels, {(before != 0).mean():.0%} acquired, 
       if before.any() else "the middle: nothing yet")
 
 # %% Wait for the next change, and look again
-request = urllib.request.Request(f"{server}/{path}/events", headers={"Last-Event-ID": str(status["revision"])})
+request = urllib.request.Request(f"{server}/{path}/events", headers={"Last-Event-ID": str(described["revision"])})
 with urllib.request.urlopen(request, timeout=60) as events:
     for line in events:
         if line.startswith(b"data:"):

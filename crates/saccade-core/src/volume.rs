@@ -85,6 +85,10 @@ pub struct Volume {
     pub looks: Vec<Look>,
     /// Voxel size at level 0 \[nm\].
     pub voxel_nm: DVec3,
+    /// How far the whole volume is moved in the space of whoever wrote it, which other images may share \[nm\]. Positions
+    /// within the volume do not know of it.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub origin_nm: DVec3,
     /// Levels, finest first; at least one.
     pub levels: Vec<Level>,
     /// Chunk size of every level \[voxels of the level\].
@@ -171,6 +175,7 @@ impl Volume {
             channels: vec!["intensity".to_owned()],
             looks: Vec::new(),
             voxel_nm,
+            origin_nm: DVec3::ZERO,
             levels: halving_levels(extent, voxel_nm),
             chunk: UVec3::new(64, 64, 32),
         })
@@ -205,6 +210,10 @@ impl Volume {
     pub fn chunks(&self, level: usize) -> UVec3 {
         (self.levels[level].extent + (self.chunk - 1)) / self.chunk
     }
+}
+
+fn is_zero(origin_nm: &DVec3) -> bool {
+    *origin_nm == DVec3::ZERO
 }
 
 /// On which side of the histogram the structures are that should be seen.
@@ -277,7 +286,9 @@ mod tests {
             Volume::new("v", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap();
         let json = serde_json::to_string(&v).unwrap();
         assert_eq!(serde_json::from_str::<Volume>(&json).unwrap(), v);
-        assert!(!json.contains("looks"), "nothing is said: {json}");
+        let silent = !json.contains("looks") && !json.contains("origin");
+        assert!(silent, "nothing is said: {json}");
+        v.origin_nm = DVec3::new(-8.0, 0.5, 1e9);
         let look = Look {
             color: Some([1, 2, 3]),
             window: Some([0.25, 0.5]),

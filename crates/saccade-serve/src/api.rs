@@ -2,6 +2,7 @@
 //!
 //! The document is made from the types that are sent and from the handlers that send them.
 
+use glam::DVec3;
 use saccade_core::levels::Level;
 use saccade_core::volume::{Dtype, Volume};
 use saccade_core::voxel_box::VoxelBox;
@@ -56,6 +57,10 @@ pub(crate) struct VolumeDocument {
     channels: Vec<String>,
     /// Voxel size of level 0, x, y, z, in nanometres.
     voxel_nm: [f64; 3],
+    /// How far the whole volume is moved in the space of whoever wrote it, x, y, z, in nanometres; where it is
+    /// missing, not at all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    origin_nm: Option<[f64; 3]>,
     /// Finest first.
     levels: Vec<LevelDocument>,
     /// Chunk size of every level, x, y, z, in its voxels.
@@ -104,6 +109,7 @@ impl From<&Volume> for VolumeDocument {
             kind: volume.kind.is_labels().then_some(KindDocument::Labels),
             channels: volume.channels.clone(),
             voxel_nm: volume.voxel_nm.to_array(),
+            origin_nm: (volume.origin_nm != DVec3::ZERO).then(|| volume.origin_nm.to_array()),
             levels: volume.levels.iter().map(level).collect(),
             chunk: volume.chunk.to_array(),
         }
@@ -183,7 +189,7 @@ pub(crate) struct Document;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DVec3, UVec3};
+    use glam::UVec3;
     use saccade_core::volume::VoxelKind;
     use serde_json::to_value;
 
@@ -198,6 +204,10 @@ mod tests {
             (Dtype::Uint16, VoxelKind::Labels),
         ] {
             (volume.dtype, volume.kind) = (dtype, kind);
+            volume.origin_nm = match kind {
+                VoxelKind::Intensity => DVec3::ZERO,
+                VoxelKind::Labels => DVec3::new(-4.0, 0.5, 1e9),
+            };
             let document = to_value(VolumeDocument::from(&volume)).unwrap();
             assert_eq!(document, to_value(&volume).unwrap());
         }

@@ -41,7 +41,8 @@
 //! | 503 with `Retry-After` | not ready, or a failure that may pass |
 //! | 503 with `Retry-After`, also | more connections, requests or event streams at once than [`Limits`] allow |
 //! | 421, 403 | a name that the server does not have, an origin that it does not let read ([`Access`]) |
-//! | 500 | reading failed for good; the log has the reason |
+//! | 424 | what the voxels are read from is damaged: `cause` says what, and asking again does not help |
+//! | 500 | the catalog cannot be read; `cause` says why |
 //!
 //! Refusals are JSON, `{"error": …, "known": […]}`, and carry the headers that let pages of other
 //! origins read them.

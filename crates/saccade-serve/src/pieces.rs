@@ -21,6 +21,9 @@ use crate::volumes::Published;
 
 /// Keep it, and ask each time whether it is still true.
 const REVALIDATE: HeaderValue = HeaderValue::from_static("no-cache");
+/// What a voxel depends on is damaged for good. Clients repeat what is answered 500, some of them for ever, and take 404 for
+/// the fill value.
+const DAMAGED: StatusCode = StatusCode::FAILED_DEPENDENCY;
 /// Its address names its state: it will never be anything else.
 const KEEP: HeaderValue = HeaderValue::from_static("public, max-age=86400, immutable");
 
@@ -145,7 +148,7 @@ pub(crate) fn failed(published: &Published, error: &ChunkError) -> Response {
                 ChunkError::Failed { source, .. } => cause(&**source),
                 other => other.to_string(),
             };
-            failing(other.to_string(), cause, after)
+            failing(other.to_string(), cause, after, DAMAGED)
         }
     }
 }

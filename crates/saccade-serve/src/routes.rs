@@ -1,5 +1,6 @@
 //! Which address is answered by what.
 
+use std::future::ready;
 use std::net::SocketAddr;
 use std::ops::Deref;
 use std::sync::Arc;
@@ -12,7 +13,7 @@ use axum::http::header::{
 };
 use axum::http::{Extensions, Method, StatusCode, Uri, Version};
 use axum::middleware::{Next, from_fn_with_state, map_response};
-use axum::response::{IntoResponse, Response};
+use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use saccade_core::volume::Dtype;
@@ -104,6 +105,14 @@ pub(crate) fn router(app: App) -> Router {
             object(app, format, name, Some(at), key, headers)
         };
         let folder = format.folder();
+        // For people: clients of these formats never ask for a folder.
+        let below = move || ready(Redirect::to(format.root()));
+        let beside = move || ready(Redirect::to(&format!("{folder}/{}", format.root())));
+        for place in ["/v/{name}", "/v/{name}/at/{version}"] {
+            router = router
+                .route(&format!("{place}/{folder}"), get(beside))
+                .route(&format!("{place}/{folder}/"), get(below));
+        }
         router = router
             .route(&format!("/v/{{name}}/{folder}/{{*key}}"), get(now))
             .route(
@@ -233,12 +242,22 @@ pub(crate) async fn status(State(app): State<App>, Path(name): Path<String>) -> 
             described(status.with_damage(published.source.damage()))
         }
         Some(source) => match source.status().await {
-            Ok(status) => described(status.with_damage(published.source.damage())),
+            Ok(status) => {
+                // The catalog may be ahead of what is served.
+                let revision = published.history().revision();
+                let status = Status { revision, ..status };
+                described(status.with_damage(published.source.damage()))
+            }
             Err(error) => {
                 let cause = cause(&*error.source);
                 log::warn!("{error}: {}", error.source);
                 let after = error.transient.then_some(Duration::from_secs(1));
-                failing(error.to_string(), cause, after)
+                failing(
+                    error.to_string(),
+                    cause,
+                    after,
+                    StatusCode::INTERNAL_SERVER_ERROR,
+                )
             }
         },
     }

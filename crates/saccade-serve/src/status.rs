@@ -11,7 +11,7 @@ use utoipa::ToSchema;
 /// The state of a volume's acquisition.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Status {
-    /// Revision of the volume.
+    /// Revision of the voxels that are served. What is counted here may be of a later one.
     pub revision: u64,
     /// Tiles that have been taken in; `None` where the volume is not made of tiles.
     pub tiles: Option<u64>,

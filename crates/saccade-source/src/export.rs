@@ -11,7 +11,7 @@
 //!
 //! The group's description, without which nobody takes the folder for an image, comes last. Until then
 //! `export.json` says what is being written; the same export begun again keeps the shards that are there, if the
-//! volume has not changed since. What changes while it is exported is exported again, until all is of one
+//! volume has not changed since; once the image is whole, its attribute `saccade` says the same, and nothing is done again. What changes while it is exported is exported again, until all is of one
 //! state.
 //!
 //! # Memory
@@ -41,6 +41,8 @@ use shard::ShardEncoder;
 pub const UNFINISHED: &str = "export.json";
 /// What makes a folder an image.
 const GROUP: &str = "zarr.json";
+/// Attribute of it that says which export it is.
+const OURS: &str = "saccade";
 /// Shards at a time: one is read while the other is compressed and written.
 const SHARDS_AT_ONCE: usize = 2;
 
@@ -55,6 +57,8 @@ pub struct ExportOptions {
     pub finest: u32,
     /// How hard zstd tries: 1 is fast, 22 small; 0 stores chunks as they are.
     pub compression: u8,
+    /// Whether ids of labels that are too large for the volume's type may become other numbers, which several may share.
+    pub rename_labels: bool,
     /// Pause before a chunk that failed for a passing reason is asked for again, if the source names none.
     pub retry: Duration,
 }
@@ -66,6 +70,7 @@ impl Default for ExportOptions {
             channels: None,
             finest: 0,
             compression: 3,
+            rename_labels: false,
             retry: Duration::from_secs(1),
         }
     }
@@ -86,6 +91,8 @@ pub struct ExportProgress {
     pub again: u64,
     /// Written \[bytes\].
     pub bytes: u64,
+    /// Whether nothing was to be done: the same export was there, and whole.
+    pub was_whole: bool,
 }
 
 /// Why nothing was exported, or not all.
@@ -131,6 +138,26 @@ pub enum ExportError {
         /// What differs between that one and this.
         differences: String,
     },
+    /// The same export is there, of another state of the volume.
+    #[error(
+        "the same export is there and whole, of the volume's revision {there}; the volume is at {now}: export to another place, \
+         or empty this one"
+    )]
+    Outdated {
+        /// Revision of the volume that was exported.
+        there: u64,
+        /// Its revision.
+        now: u64,
+    },
+    /// An id of labels has no room in the image that would be written.
+    #[error(
+        "the labels have ids such as {id}, which do not fit into the 16 bits of an exported voxel; copy the image as it is, or \
+         let such ids become other numbers, which several may share"
+    )]
+    Label {
+        /// The id.
+        id: u64,
+    },
     /// Voxels could not be had.
     #[error("cannot read what is to be exported")]
     Read {
@@ -167,15 +194,21 @@ pub async fn export(
     let plan = Plan::new(source.volume(), options)?;
     // Listened to first: what changes from here on is in the stream.
     let mut changes = source.changes();
-    let revision = source.revision();
-    let resumed = begin(storage, &plan, revision).await?;
+    let mut revision = source.revision();
+    let begun = begin(storage, &plan, revision).await?;
 
     let mut all: Vec<ShardId> = plan.shards().collect();
     let mut state = ExportProgress {
         shards: all.len() as u64,
+        was_whole: begun == Begun::Whole,
         ..ExportProgress::default()
     };
-    if resumed {
+    if state.was_whole {
+        (state.kept, state.done) = (state.shards, state.shards);
+        progress(state);
+        return Ok(state);
+    }
+    if begun == Begun::Partly {
         let mut there = BTreeSet::new();
         for level in 0..plan.levels.len() {
             there.extend(storage.list(&format!("{level}/c/")).await?);
@@ -193,6 +226,10 @@ pub async fn export(
                 let (encoder, plan) = (&encoder, &plan);
                 async move {
                     let bytes = encoder.shard(source, plan, shard, options.retry).await?;
+                    // Before it is written: an export that goes on keeps what is there.
+                    if let Some(id) = source.renamed_label().filter(|_| !plan.rename_labels) {
+                        return Err(ExportError::Label { id });
+                    }
                     write(storage, &shard.key(), bytes).await
                 }
             })
@@ -207,6 +244,7 @@ pub async fn export(
         drop(written);
         let mut again = BTreeSet::new();
         while let Some(Some(change)) = changes.next().now_or_never() {
+            revision = revision.max(change.revision);
             again.extend(plan.touched(change.voxels));
         }
         if again.is_empty() {
@@ -224,36 +262,67 @@ pub async fn export(
             .write_durable(&format!("{level}/zarr.json"), text)
             .await?;
     }
-    storage.write_durable(GROUP, pretty(&plan.group())).await?;
+    let mut group = plan.group();
+    group["attributes"][OURS] = state_of(&plan, revision);
+    storage.write_durable(GROUP, pretty(&group)).await?;
     storage.delete(UNFINISHED).await?;
     Ok(state)
 }
 
-/// Says what is being written; whether shards that are there are still right.
-async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<bool, ExportError> {
-    let ours = plan.description();
-    let with_revision = serde_json::json!({ "export": ours, "revision": revision });
-    let state = match storage.read(UNFINISHED, None).await {
-        Ok(state) => Some(state),
-        Err(StorageError::NotFound { .. }) => None,
-        Err(error) => return Err(error.into()),
-    };
-    if let Some(state) = state {
-        let begun: serde_json::Value = serde_json::from_slice(&state).unwrap_or_default();
-        if begun["export"] != ours {
-            let differences = plan::differences(&begun["export"], &ours);
+/// What there is of an export before it begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Begun {
+    /// Nothing, or nothing that is still right.
+    Not,
+    /// Shards that are still right.
+    Partly,
+    /// All of it.
+    Whole,
+}
+
+/// What is exported, and of which state of the volume.
+fn state_of(plan: &Plan, revision: u64) -> serde_json::Value {
+    serde_json::json!({ "export": plan.description(), "revision": revision })
+}
+
+async fn json(storage: &dyn Storage, key: &str) -> Result<Option<serde_json::Value>, ExportError> {
+    match storage.read(key, None).await {
+        Ok(text) => Ok(Some(serde_json::from_slice(&text).unwrap_or_default())),
+        Err(StorageError::NotFound { .. }) => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// Says what is being written, unless all of it is there.
+async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<Begun, ExportError> {
+    let ours = state_of(plan, revision);
+    if let Some(begun) = json(storage, UNFINISHED).await? {
+        if begun["export"] != ours["export"] {
+            let differences = plan::differences(&begun["export"], &ours["export"]);
             return Err(ExportError::Other { differences });
         }
-        if begun == with_revision {
-            return Ok(true);
+        if begun == ours {
+            return Ok(Begun::Partly);
         }
+        // It may have been whole but for the end of this object: no image while it is written anew.
+        storage.delete(GROUP).await?;
+    } else if let Some(group) = json(storage, GROUP).await? {
+        let there = &group["attributes"][OURS];
+        if there["export"] != ours["export"] {
+            return Err(ExportError::Exists);
+        }
+        return match there["revision"].as_u64().unwrap_or_default() {
+            there if there == revision => Ok(Begun::Whole),
+            there => Err(ExportError::Outdated {
+                there,
+                now: revision,
+            }),
+        };
     } else if !storage.list("").await?.is_empty() {
         return Err(ExportError::Exists);
     }
-    storage
-        .write_durable(UNFINISHED, pretty(&with_revision))
-        .await?;
-    Ok(false)
+    storage.write_durable(UNFINISHED, pretty(&ours)).await?;
+    Ok(Begun::Not)
 }
 
 /// Writes a shard, or removes one that holds nothing any more; how many bytes it has.

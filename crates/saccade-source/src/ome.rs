@@ -16,7 +16,7 @@ const COLORS: [&str; 6] = ["00FF00", "FF00FF", "00FFFF", "FFFF00", "FF0000", "00
 pub struct Placed {
     /// Size of a voxel \[nm\].
     pub voxel_nm: DVec3,
-    /// Middle of the first voxel, from that of the volume's first voxel of level 0 \[nm\].
+    /// Middle of the first voxel, from that of the first voxel of level 0 of a volume that is not moved \[nm\].
     pub first_nm: DVec3,
 }
 
@@ -27,7 +27,7 @@ pub fn placed(volume: &Volume) -> Vec<Placed> {
         let voxel_nm = volume.voxel_nm * level.downsampling;
         Placed {
             voxel_nm,
-            first_nm: (voxel_nm - volume.voxel_nm) / 2.0,
+            first_nm: volume.origin_nm + (voxel_nm - volume.voxel_nm) / 2.0,
         }
     });
     placed.collect()
@@ -151,6 +151,19 @@ mod tests {
                 (number(0, "scale", 0), number(1, "translation", 0)),
                 (1.0, 0.0)
             );
+        }
+    }
+
+    #[test]
+    fn what_is_moved_is_moved_at_every_level() {
+        let (still, mut moved) = (volume(), volume());
+        moved.origin_nm = DVec3::new(-12.0, 1e6, 0.25);
+        for (still, moved) in placed(&still).into_iter().zip(placed(&moved)) {
+            assert_eq!(
+                moved.first_nm,
+                still.first_nm + DVec3::new(-12.0, 1e6, 0.25)
+            );
+            assert_eq!(moved.voxel_nm, still.voxel_nm);
         }
     }
 

@@ -4,7 +4,8 @@
 //! levels and channels. Where a store compresses in transport, copies of it are read as well, in folders and over HTTP (`NAME.gz`, or
 //! compressed without saying so).
 //!
-//! The finest level is where the volume is; others lie where their `voxel_offset` says, which may be off by less than one of their
+//! The finest level is where the volume is, and how far that is from 0, 0, 0 is kept in
+//! [`Volume::origin_nm`](saccade_core::volume::Volume::origin_nm); others lie where their `voxel_offset` says, which may be off by less than one of their
 //! voxels, since it is rounded.
 //!
 //! # Values
@@ -33,7 +34,7 @@ use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
-use crate::stored::{StoredSource, volume_name};
+use crate::stored::{Stored, StoredSource, volume_name};
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 pub(crate) use decode::Packing;
 pub use error::PrecomputedError;
@@ -96,8 +97,9 @@ impl PrecomputedSource {
                 "its first voxel is {x}, {y}, {z} elsewhere, and 0, 0, 0 here (voxel_offset)"
             ));
         }
-        for scale in &info.scales {
-            notes.extend(scale.placed.note(&format!("{:?}", scale.key)));
+        for (scale, level) in info.scales.iter().zip(&volume.levels) {
+            let key = format!("{:?}", scale.key);
+            notes.extend(scale.placed.note(&key, level.extent));
         }
         let stored = PrecomputedImage::new(objects, volume, info).await;
         let stored = stored.map_err(|source| PrecomputedError::Sample { source })?;
@@ -124,6 +126,10 @@ impl VolumeSource for PrecomputedSource {
         self.stored.read(id)
     }
 
+    fn renamed_label(&self) -> Option<u64> {
+        self.stored.renamed_label()
+    }
+
     fn changes(&self) -> BoxStream<'static, Change> {
         self.stored.changes()
     }
@@ -148,6 +154,7 @@ fn volume(name: &str, info: &Info) -> Result<Volume, Refusal> {
     if info.is_segmentation && info.number.is_whole() {
         volume.kind = VoxelKind::Labels;
     }
+    volume.origin_nm = finest.corner_nm();
     volume.chunk = CHUNK;
     volume.channels = (0..info.channels).map(|n| format!("channel {n}")).collect();
     let mut by = DVec3::ONE;

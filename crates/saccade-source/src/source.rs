@@ -217,6 +217,12 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
         Vec::new()
     }
 
+    /// An id of labels among what was read so far that is another number in the volume, which other ids may share, since
+    /// the volume's type is too narrow for it.
+    fn renamed_label(&self) -> Option<u64> {
+        None
+    }
+
     /// Bounds of a chunk's measured values, if they are at hand.
     fn value_range(&self, _id: ChunkId) -> Option<ValueRange> {
         None

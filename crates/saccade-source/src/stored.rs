@@ -18,6 +18,7 @@ use saccade_core::voxel_box::VoxelBox;
 use crate::flights::{Flights, Weighed, Work};
 use crate::maybe_send::{BoxFuture, BoxStream, MaybeSend, MaybeSync};
 use crate::objects::ObjectError;
+use crate::values::Values;
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 
 pub(crate) use piece::{ChunkMut, Place, copy, fill};
@@ -85,6 +86,16 @@ pub enum PieceError {
 }
 
 impl PieceError {
+    /// What is wrong and how to mend it, without saying where the image is kept: for those who only look.
+    pub fn without_place(&self) -> String {
+        match self {
+            Self::Unread { source, .. } => format!("{self}: {}", source.without_place()),
+            Self::Damaged { reason, which, .. } => format!(
+                "{which} is damaged where the image is kept, and has to be written there anew: {reason}"
+            ),
+        }
+    }
+
     fn is_transient(&self) -> bool {
         match self {
             Self::Unread { source, .. } => source.is_transient(),
@@ -100,6 +111,9 @@ pub(crate) type Pieces = Work<PieceId, Piece, PieceError>;
 pub(crate) trait Stored: MaybeSend + MaybeSync + 'static {
     /// What the image is.
     fn volume(&self) -> &Arc<Volume>;
+
+    /// How stored numbers become values of the volume.
+    fn values(&self) -> &Values;
 
     /// Where what is stored of a level lies in it.
     fn placed(&self, level: u32) -> Placed;
@@ -216,6 +230,10 @@ impl<F: Stored> VolumeSource for StoredSource<F> {
 
     fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
         Box::pin(self.chunk(id))
+    }
+
+    fn renamed_label(&self) -> Option<u64> {
+        self.format.values().renamed()
     }
 
     /// Nobody tells of changes in files.

@@ -1,7 +1,7 @@
 //! Numbers of all kinds, and what becomes of them in volumes of 8 and 16 bit.
 
 use std::fmt;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
@@ -97,6 +97,9 @@ pub(crate) struct Values {
     way: Way,
     #[serde(skip)]
     told: AtomicBool,
+    /// A name that was met and is shown as another number; 0 for none.
+    #[serde(skip)]
+    renamed: AtomicU64,
 }
 
 impl Values {
@@ -136,7 +139,14 @@ impl Values {
             big_endian,
             way,
             told: AtomicBool::new(false),
+            renamed: AtomicU64::new(0),
         }
+    }
+
+    /// A name that is shown as another number, if one was met.
+    pub(crate) fn renamed(&self) -> Option<u64> {
+        let name = self.renamed.load(Ordering::Relaxed);
+        (name != 0).then_some(name)
     }
 
     /// Where a value of the volume comes from, as a line: the number times the first plus the second. Means nothing of names.
@@ -259,6 +269,7 @@ impl Values {
             }
             Way::Window(_) => self.windowed(value as f64),
             Way::Names => u16::try_from(name).unwrap_or_else(|_| {
+                self.renamed.store(name, Ordering::Relaxed);
                 // Fibonacci hashing: neighbours in number are far apart.
                 let mixed = (name ^ (name >> 32)).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
                 u16::try_from(1 + mixed % 65_535).expect("at most 65535")

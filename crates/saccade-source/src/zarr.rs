@@ -8,7 +8,8 @@
 //! translation or identity, alone or in sequence. Transformations that lead from there to others are told in
 //! [`ZarrSource::notes`], not applied; scenes of several images are refused with their names.
 //!
-//! The finest level is where the volume is. Others lie where their transformations say: they may cover a part of it, or more. By up to
+//! The finest level is where the volume is; how far it is moved as a whole is kept in
+//! [`Volume::origin_nm`](saccade_core::volume::Volume::origin_nm). Others lie where their transformations say: they may cover a part of it, or more. By up to
 //! half of its voxels a level may be off, since writers mean the middle or the corner of a voxel; what is further away is
 //! told in [`ZarrSource::notes`].
 //!
@@ -55,7 +56,7 @@ use serde_json::Value;
 
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
-use crate::stored::{StoredSource, volume_name};
+use crate::stored::{Stored, StoredSource, volume_name};
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 use array::Array;
 use error::Refusal;
@@ -175,6 +176,10 @@ impl VolumeSource for ZarrSource {
         self.stored.read(id)
     }
 
+    fn renamed_label(&self) -> Option<u64> {
+        self.stored.renamed_label()
+    }
+
     fn changes(&self) -> BoxStream<'static, Change> {
         self.stored.changes()
     }
@@ -266,6 +271,7 @@ fn volume(name: &str, image: &Image, levels: &mut [LevelArray]) -> Result<Volume
     if image.is_labels && finest.number().is_whole() {
         volume.kind = VoxelKind::Labels;
     }
+    volume.origin_nm = image.origin_nm;
     volume.chunk = CHUNK;
     volume.channels = (0..finest.channels())
         .map(|index| match image.channels.get(index as usize) {

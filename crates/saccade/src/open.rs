@@ -72,11 +72,7 @@ fn passes(error: &CatalogError) -> bool {
 
 /// Refuses what an export has left that is not whole, which is neither an image nor an archive.
 fn refuse_half_export(location: &ArchiveLocation) -> Result<()> {
-    let begun = |folder: &Path| {
-        folder.join(export::UNFINISHED).is_file()
-            && !folder.join(VisualizationArchive::CATALOG).exists()
-    };
-    if let Some(folder) = location.folder().filter(|folder| begun(folder)) {
+    if let Some(folder) = location.folder().filter(|folder| is_half_export(folder)) {
         bail!(
             "an export to this folder was begun and is not whole yet: wait for it, or repeat the command, \
              which goes on with it: {}",
@@ -84,6 +80,11 @@ fn refuse_half_export(location: &ArchiveLocation) -> Result<()> {
         );
     }
     Ok(())
+}
+
+fn is_half_export(folder: &Path) -> bool {
+    folder.join(export::UNFINISHED).is_file()
+        && !folder.join(VisualizationArchive::CATALOG).exists()
 }
 
 /// Where a volume is.
@@ -120,10 +121,15 @@ impl FromStr for Place {
     }
 }
 
-/// Whether an image that somebody else wrote is in a folder, or what they know as one (N5), which is refused by name.
+/// Whether an image that somebody else wrote is in a folder, or what they know as one (N5), or should be by the folder's name:
+/// then what is missing is an image.
 fn is_image(folder: &Path) -> bool {
     let has = |name: &str| folder.join(name).is_file();
-    ZarrSource::is_zarr(folder) || has("info") || has("attributes.json")
+    let is_archive = || has(VisualizationArchive::CATALOG) || is_half_export(folder);
+    let named = folder
+        .extension()
+        .is_some_and(|extension| extension == "zarr" || extension == "n5");
+    ZarrSource::is_zarr(folder) || has("info") || has("attributes.json") || (named && !is_archive())
 }
 
 /// Opens an image, and tells what its user should know.

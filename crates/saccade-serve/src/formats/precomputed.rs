@@ -1,9 +1,10 @@
 //! Neuroglancer precomputed: raw, unsharded; labels of one channel as a segmentation, which cannot have more.
 //!
 //! Axes are x, y, z as in the rest of this project, the origin is the corner of voxel 0, so levels
-//! need no translation, and chunks end where the volume does.
+//! need no translation, and chunks end where the volume does. A volume that is moved as a whole has an offset in whole
+//! voxels of each level, as the format wants it, from which the names of its chunks count.
 
-use glam::UVec3;
+use glam::{I64Vec3, UVec3};
 use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 use serde_json::{Value, json};
@@ -18,8 +19,18 @@ pub(super) fn entry(volume: &Volume, key: &str) -> Result<Entry, Unknown> {
     }
     let (level, voxels) = key.split_once('/').ok_or_else(unknown)?;
     let level = number(level).ok_or_else(unknown)?;
-    let voxels = bounds(voxels).ok_or_else(unknown)?;
-    piece(volume, level, voxels)
+    let (min, max) = bounds(voxels).ok_or_else(unknown)?;
+    let inside = level_index(volume, level).and_then(|index| {
+        let offset = offset(volume, index);
+        let of = |corner: I64Vec3| {
+            let axes = (corner - offset).to_array().map(|n| u32::try_from(n).ok());
+            let [x, y, z] = axes;
+            Some(UVec3::new(x?, y?, z?))
+        };
+        Some(VoxelBox::new(of(min)?, of(max)?))
+    });
+    inside
+        .and_then(|voxels| piece(volume, level, voxels))
         .map(Entry::Piece)
         .ok_or_else(|| per_level(volume, &first_and_size(volume)))
 }
@@ -29,7 +40,7 @@ fn info(volume: &Volume) -> Value {
         json!({
             "key": level.to_string(),
             "size": geometry.extent.to_array(),
-            "voxel_offset": [0, 0, 0],
+            "voxel_offset": offset(volume, level).to_array(),
             "resolution": (volume.voxel_nm * geometry.downsampling).to_array(),
             "chunk_sizes": [volume.chunk.to_array()],
             "encoding": "raw",
@@ -52,6 +63,17 @@ fn info(volume: &Volume) -> Value {
     })
 }
 
+/// How far a level is moved, to the nearest of its voxels.
+fn offset(volume: &Volume, level: usize) -> I64Vec3 {
+    let voxel_nm = volume.voxel_nm * volume.levels[level].downsampling;
+    // Far from the ends of what can be counted, so that corners can be added.
+    let far = f64::from(1 << 30) * f64::from(1 << 20);
+    (volume.origin_nm / voxel_nm)
+        .round()
+        .clamp(glam::DVec3::splat(-far), glam::DVec3::splat(far))
+        .as_i64vec3()
+}
+
 /// The piece that covers exactly these voxels of a level.
 fn piece(volume: &Volume, level: u32, voxels: VoxelBox) -> Option<Piece> {
     let extent = volume.levels[level_index(volume, level)?].extent;
@@ -66,22 +88,38 @@ fn piece(volume: &Volume, level: u32, voxels: VoxelBox) -> Option<Piece> {
     })
 }
 
-/// `x0-x1_y0-y1_z0-z1`.
-fn bounds(text: &str) -> Option<VoxelBox> {
+/// `x0-x1_y0-y1_z0-z1`: the first voxel, and the one beyond the last.
+fn bounds(text: &str) -> Option<(I64Vec3, I64Vec3)> {
     let axis = |text: &str| {
-        let (first, end) = text.split_once('-')?;
-        Some((number(first)?, number(end)?))
+        // A minus may be the sign of the first number.
+        let between = 1 + text.get(1..)?.find('-')?;
+        Some((whole(&text[..between])?, whole(&text[between + 1..])?))
     };
     let axes: Vec<_> = text.split('_').map(axis).collect::<Option<_>>()?;
     let [x, y, z] = axes[..] else { return None };
-    let (min, max) = (UVec3::new(x.0, y.0, z.0), UVec3::new(x.1, y.1, z.1));
-    Some(VoxelBox::new(min, max))
+    Some((I64Vec3::new(x.0, y.0, z.0), I64Vec3::new(x.1, y.1, z.1)))
+}
+
+/// A whole number in its only spelling.
+fn whole(text: &str) -> Option<i64> {
+    let (digits, sign) = match text.strip_prefix('-') {
+        Some(digits) => (digits, -1),
+        None => (text, 1),
+    };
+    let plain = (1..=16).contains(&digits.len())
+        && digits.bytes().all(|b| b.is_ascii_digit())
+        && (text == "0" || !digits.starts_with('0'));
+    plain.then(|| Some(sign * digits.parse::<i64>().ok()?))?
 }
 
 /// An example with the size of chunks.
 fn first_and_size(volume: &Volume) -> String {
     let UVec3 { x, y, z } = volume.chunk;
-    format!("L/0-{x}_0-{y}_0-{z}, chunks of {x} x {y} x {z} voxels that end with the level")
+    let first = offset(volume, 0).to_array();
+    let name = { first.iter().zip([x, y, z]) }
+        .map(|(first, size)| format!("{first}-{}", first + i64::from(size)));
+    let name = name.collect::<Vec<_>>().join("_");
+    format!("L/{name}, chunks of {x} x {y} x {z} voxels that end with the level")
 }
 
 #[cfg(test)]
@@ -117,6 +155,54 @@ mod tests {
     }
 
     #[test]
+    fn chunks_of_a_moved_volume_are_named_from_its_offset() {
+        let (still, mut moved) = (volume(), volume());
+        // 5 nm are more than half a voxel of level 0, and less than half of those from level 2 on.
+        moved.origin_nm = glam::DVec3::new(-400.0, 5.0, 1200.0);
+        let info = info(&moved);
+        for (index, level) in moved.levels.iter().enumerate() {
+            let voxel_nm = moved.voxel_nm * level.downsampling;
+            let offset = (moved.origin_nm / voxel_nm).round().to_array();
+            assert_eq!(
+                info["scales"][index]["voxel_offset"],
+                json!(offset.map(|n| n as i64))
+            );
+            let [ox, oy, oz] = offset.map(|n| n as i64);
+            for chunk in VoxelBox::of_size(moved.chunks(index)).iter() {
+                let min = (chunk * moved.chunk).as_i64vec3();
+                let max = (chunk * moved.chunk + moved.chunk)
+                    .min(level.extent)
+                    .as_i64vec3();
+                let key = |x, y, z| {
+                    format!(
+                        "{index}/{}-{}_{}-{}_{}-{}",
+                        min.x + x,
+                        max.x + x,
+                        min.y + y,
+                        max.y + y,
+                        min.z + z,
+                        max.z + z
+                    )
+                };
+                let own = entry(&moved, &key(ox, oy, oz));
+                assert!(own.is_ok(), "{}", key(ox, oy, oz));
+                assert_eq!(own, entry(&still, &key(0, 0, 0)));
+            }
+        }
+        assert_eq!(info["scales"][0]["voxel_offset"], json!([-100, 1, 30]));
+        assert!(entry(&moved, "0/0-64_0-48_0-32").is_err());
+        let Err(unknown) = entry(&moved, "0/0-1_0-1_0-1") else {
+            panic!("a chunk of one voxel")
+        };
+        assert!(
+            unknown.known[0].starts_with("0/-100--36_1-49_30-62"),
+            "{:?}",
+            unknown.known
+        );
+        assert!(entry(&moved, "0/-100--36_1-49_30-62").is_ok());
+    }
+
+    #[test]
     fn other_boxes_do_not_exist() {
         let others = [
             "0/0-64_0-48_0-31",
@@ -129,6 +215,12 @@ mod tests {
             "0/0-64_0-48_0-32/",
             "99/0-64_0-48_0-32",
             "0/4294967295-4294967295_0-48_0-32",
+            "0/-0-64_0-48_0-32",
+            "0/--0-64_0-48_0-32",
+            "0/-9999999999999999--9999999999999998_0-48_0-32",
+            "0/99999999999999999999-99999999999999999999_0-48_0-32",
+            "0/0-\u{0661}_0-48_0-32",
+            "0/é-64_0-48_0-32",
             "zarr.json",
         ];
         for key in others {

@@ -8,6 +8,7 @@ use axum::http::StatusCode;
 use axum::http::header::{CACHE_CONTROL, RETRY_AFTER};
 use axum::response::{IntoResponse, Response};
 use saccade_archive::catalog::CatalogError;
+use saccade_source::PieceError;
 use saccade_source::remote::RemoteError;
 use saccade_source::stitched::StitchError;
 use serde::Serialize;
@@ -66,11 +67,12 @@ fn with_retry(mut response: Response, after: Duration) -> Response {
     response
 }
 
-/// What the server works with fails, `cause` says how: 503 if it may pass by `after`, else 500.
+/// What the server works with fails, `cause` says how: 503 if it may pass by `after`, else `lasting`.
 pub(crate) fn failing(
     error: impl Into<String>,
     cause: impl Into<String>,
     after: Option<Duration>,
+    lasting: StatusCode,
 ) -> Response {
     let refusal = Refusal {
         error: error.into(),
@@ -79,7 +81,7 @@ pub(crate) fn failing(
     };
     match after {
         Some(after) => with_retry(answer(StatusCode::SERVICE_UNAVAILABLE, refusal), after),
-        None => answer(StatusCode::INTERNAL_SERVER_ERROR, refusal),
+        None => answer(lasting, refusal),
     }
 }
 
@@ -89,6 +91,8 @@ pub(crate) fn cause(error: &(dyn Error + 'static)) -> String {
     if let Some(error) = error.downcast_ref::<StitchError>() {
         error.without_place()
     } else if let Some(error) = error.downcast_ref::<CatalogError>() {
+        error.without_place()
+    } else if let Some(error) = error.downcast_ref::<PieceError>() {
         error.without_place()
     } else if let Some(error) = error.downcast_ref::<RemoteError>() {
         error.to_string()

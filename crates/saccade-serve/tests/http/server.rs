@@ -105,7 +105,7 @@ fn failures_name_their_cause_and_no_place() {
         };
         for (path, expected) in [
             ("status.json", StatusCode::SERVICE_UNAVAILABLE),
-            ("zarr/0/c/0/0/0/0", StatusCode::INTERNAL_SERVER_ERROR),
+            ("zarr/0/c/0/0/0/0", StatusCode::FAILED_DEPENDENCY),
         ] {
             let (status, refusal) = get(path).await;
             assert_eq!(status, expected);
@@ -159,11 +159,7 @@ fn trouble_says_whether_to_ask_again() {
             Some("1"),
         ),
         (|_| None, StatusCode::SERVICE_UNAVAILABLE, Some("1")),
-        (
-            |id| failed(id, false),
-            StatusCode::INTERNAL_SERVER_ERROR,
-            None,
-        ),
+        (|id| failed(id, false), StatusCode::FAILED_DEPENDENCY, None),
     ];
     run(async move {
         for (trouble, status, retry) in cases {

@@ -73,6 +73,8 @@ pub(super) struct Plan {
     pub(super) channels: Vec<u32>,
     pub(super) levels: Vec<PlannedLevel>,
     compression: u8,
+    /// Whether ids of labels may become other numbers.
+    pub(super) rename_labels: bool,
 }
 
 impl Plan {
@@ -114,6 +116,7 @@ impl Plan {
             channels,
             levels,
             compression: options.compression.min(22),
+            rename_labels: options.rename_labels,
         })
     }
 
@@ -161,6 +164,9 @@ impl Plan {
         });
         if self.volume.kind.is_labels() {
             description["labels"] = true.into();
+        }
+        if self.rename_labels {
+            description["renamed"] = true.into();
         }
         description
     }
@@ -246,13 +252,16 @@ pub(super) fn differences(there: &Value, now: &Value) -> String {
         Value::Null => "none".to_owned(),
         level => level.to_string(),
     };
-    let facts: [(&str, &Fact<'_>); 6] = [
+    let facts: [(&str, &Fact<'_>); 7] = [
         ("volume", &|of| list(&of["volume"])),
         ("the volume's extent", &|of| list(&level(of))),
         ("finest level", &|of| list(&of["finest"])),
         ("region in voxels of that level", &region),
         ("channels", &|of| list(&of["channels"])),
         ("compression", &compression),
+        ("ids of labels may be renamed:", &|of| {
+            (of["renamed"] == true).to_string()
+        }),
     ];
     let differing = facts.iter().filter_map(|(name, fact)| {
         let (there, now) = (fact(there), fact(now));

@@ -1,5 +1,5 @@
 use std::path::Path;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 
 use glam::{DVec3, UVec3};
@@ -21,25 +21,38 @@ fn run<T>(test: impl Future<Output = T>) -> T {
     { runtime }.enable_all().build().unwrap().block_on(test)
 }
 
+/// Where the whole of it lies.
+const ORIGIN_NM: DVec3 = DVec3::new(-1000.0, 36.0, 0.5);
+
 /// Two channels of 16 bit; what a voxel is worth follows from where it is. Nothing was acquired below
 /// z = 4 of level 0's first channel.
 struct Formula {
     volume: Arc<Volume>,
     failures: AtomicU32,
     transient: bool,
+    /// An id that does not fit, and the level in which it is met first.
+    wide: Option<(u64, u32)>,
+    met: AtomicBool,
 }
 
 impl Formula {
     fn new(failures: u32, transient: bool) -> Arc<Self> {
+        Self::with_ids(failures, transient, None)
+    }
+
+    fn with_ids(failures: u32, transient: bool, wide: Option<(u64, u32)>) -> Arc<Self> {
         let extent = UVec3::new(75, 53, 13);
         let mut volume = Volume::new("em", extent, DVec3::new(4.0, 4.0, 8.0)).unwrap();
         volume.channels = ["a", "b", "c"].map(Into::into).into();
         volume.dtype = Dtype::Uint16;
         volume.chunk = UVec3::new(9, 8, 4);
+        volume.origin_nm = ORIGIN_NM;
         Arc::new(Self {
             volume: Arc::new(volume),
             failures: AtomicU32::new(failures),
             transient,
+            wide,
+            met: AtomicBool::new(false),
         })
     }
 
@@ -68,6 +81,9 @@ impl VolumeSource for Formula {
                     source: Arc::new(std::io::Error::other("no luck")),
                 });
             }
+            if self.wide.is_some_and(|(_, level)| level == id.level) {
+                self.met.store(true, Ordering::SeqCst);
+            }
             let inside = id
                 .voxels(&self.volume)
                 .ok_or(ChunkError::OutOfRange { id })?;
@@ -87,6 +103,11 @@ impl VolumeSource for Formula {
                 Chunk::Voxels(bytes.into())
             })
         })
+    }
+
+    fn renamed_label(&self) -> Option<u64> {
+        let (id, _) = self.wide?;
+        self.met.load(Ordering::SeqCst).then_some(id)
     }
 
     fn changes(&self) -> BoxStream<'static, Change> {
@@ -153,7 +174,7 @@ fn every_voxel_of_every_level_is_where_it_was() {
                 let scale = transforms[0]["scale"][axis].as_f64().unwrap();
                 let moved = transforms[1]["translation"][axis].as_f64().unwrap_or(0.0);
                 // The first edge, from that of the volume [level-0 voxels].
-                let edge = (moved - scale / 2.0) / volume.voxel_nm[i] + 0.5;
+                let edge = (moved - ORIGIN_NM[i] - scale / 2.0) / volume.voxel_nm[i] + 0.5;
                 assert_eq!(edge, f64::from(voxels.min[i]) * geometry.downsampling[i]);
                 assert_eq!(scale, volume.voxel_nm[i] * geometry.downsampling[i]);
             };
@@ -276,9 +297,56 @@ fn what_is_there_is_not_mixed_with_something_else() {
     assert!(text.contains("channels 0,1,2 there, 1 now"), "{text}");
     assert!(text.contains("1,2,3,20,20,13 now"), "{text}");
     assert!(text.len() < 400, "{text}");
-    run(export(&source, &storage, &options, &|_| {})).unwrap();
-    let refused = run(export(&source, &storage, &options, &|_| {}));
-    assert!(matches!(refused, Err(ExportError::Exists)), "{refused:?}");
+    let done = run(export(&source, &storage, &options, &|_| {})).unwrap();
+    assert!(!done.was_whole);
+    let before = image(&storage);
+    let again = run(export(&source, &storage, &options, &|_| {})).unwrap();
+    assert!(again.was_whole && again.done == again.shards && again.bytes == 0);
+    assert!(image(&storage) == before);
+    for (other, there) in [(other, &storage as &dyn Storage), (options, &foreign())] {
+        let refused = run(export(&source, there, &other, &|_| {}));
+        assert!(matches!(refused, Err(ExportError::Exists)), "{refused:?}");
+    }
+}
+
+/// An image that somebody else wrote.
+fn foreign() -> MemoryStorage {
+    let storage = MemoryStorage::new();
+    run(storage.write_durable(GROUP, "{\"attributes\": {}}".into())).unwrap();
+    storage
+}
+
+#[test]
+fn ids_without_room_are_not_written() {
+    let storage = MemoryStorage::new();
+    let options = ExportOptions::default();
+    // Met in the finest level, after the coarse ones are written.
+    let source = || -> Arc<dyn VolumeSource> { Formula::with_ids(0, true, Some((70_000, 0))) };
+    for _ in 0..2 {
+        let refused = run(export(&source(), &storage, &options, &|_| {})).unwrap_err();
+        assert!(
+            refused.to_string().contains("ids such as 70000"),
+            "{refused}"
+        );
+        let finest = run(storage.list("0/c/")).unwrap();
+        assert!(
+            finest.is_empty(),
+            "an attempt that goes on would keep them: {finest:?}"
+        );
+        assert!(!names(&storage).contains(&GROUP.to_owned()));
+    }
+    let allowed = ExportOptions {
+        rename_labels: true,
+        ..options.clone()
+    };
+    let other = run(export(&source(), &storage, &allowed, &|_| {})).unwrap_err();
+    assert!(
+        other.to_string().contains("renamed: false there, true now"),
+        "{other}"
+    );
+    run(export(&source(), &MemoryStorage::new(), &allowed, &|_| {})).unwrap();
+    let narrow: Arc<dyn VolumeSource> = Formula::new(0, true);
+    run(export(&narrow, &MemoryStorage::new(), &options, &|_| {})).unwrap();
 }
 
 #[test]
@@ -384,6 +452,15 @@ fn what_changes_meanwhile_is_exported_again() {
         image(&other) != image(&expected),
         "the change does not show"
     );
+
+    // What was exported is of the state after the change, and not of a later one.
+    let again = |source| run(export(source, &storage, &ExportOptions::default(), &|_| {}));
+    assert!(again(&source).unwrap().was_whole);
+    live.set(changed, &new_values).unwrap();
+    let refused = again(&source).unwrap_err().to_string();
+    let (there, now) = (live.revision() - 1, live.revision());
+    let words = format!("revision {there}; the volume is at {now}");
+    assert!(refused.contains(&words), "{refused}");
 
     // One that was begun before a change is begun anew.
     let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));

@@ -72,6 +72,25 @@ pub enum ObjectError {
 }
 
 impl ObjectError {
+    /// What is wrong, without saying where the image is kept: for those who only look.
+    pub fn without_place(&self) -> String {
+        let location = match self {
+            Self::Key { key, .. } => return format!("{key:?} names nothing there"),
+            Self::Io { source, .. } => return format!("its file cannot be read: {source}"),
+            Self::Denied { location, .. }
+            | Self::Answer { location, .. }
+            | Self::Unavailable { location, .. }
+            | Self::Replaced { location }
+            | Self::TooLong { location, .. }
+            | Self::TooShort { location, .. } => location,
+        };
+        let whole = self.to_string();
+        match whole.strip_suffix(location.as_str()) {
+            Some(rest) => rest.trim_end_matches(": ").to_owned(),
+            None => whole,
+        }
+    }
+
     /// Whether the same may succeed later.
     pub fn is_transient(&self) -> bool {
         matches!(self, Self::Unavailable { .. } | Self::Io { .. })

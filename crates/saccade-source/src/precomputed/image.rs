@@ -77,10 +77,6 @@ impl PrecomputedImage {
         Ok(image)
     }
 
-    pub(super) fn values(&self) -> &Values {
-        &self.values
-    }
-
     /// About what a decoded chunk takes \[bytes\].
     pub(super) fn piece_bytes(&self) -> u64 {
         let scale = &self.info.scales[0];
@@ -388,6 +384,10 @@ impl PrecomputedImage {
 impl Stored for PrecomputedImage {
     fn volume(&self) -> &Arc<Volume> {
         &self.volume
+    }
+
+    fn values(&self) -> &Values {
+        &self.values
     }
 
     fn placed(&self, level: u32) -> Placed {

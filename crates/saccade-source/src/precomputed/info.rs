@@ -71,7 +71,7 @@ impl Scale {
     }
 
     /// Of its first voxel, in the space of all levels.
-    fn corner_nm(&self) -> DVec3 {
+    pub(super) fn corner_nm(&self) -> DVec3 {
         I64Vec3::from(self.offset).as_dvec3() * self.resolution
     }
 }

@@ -136,6 +136,7 @@ async fn levels_lie_where_their_offsets_say() {
             .await
             .unwrap();
         let volume = source.volume().clone();
+        assert_eq!(volume.origin_nm.to_array(), [56.0, -160.0, 120.0]);
         let oracle = |id: ChunkId, off: glam::IVec3| {
             let size = if id.level == 0 { SIZE } else { coarse };
             let begin = if id.level == 0 {

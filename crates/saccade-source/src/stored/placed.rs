@@ -69,12 +69,21 @@ impl Placed {
         Some((own, inside.as_uvec3()))
     }
 
-    /// Where it begins, if that is not where the volume does, in words about a level of this name.
-    pub(crate) fn note(&self, level: &str) -> Option<String> {
+    /// What of a level of this name is not as one expects, in words: that it begins elsewhere than the volume, or ends
+    /// elsewhere, as if the finest one had another size. `extent` is what [`Self::level`] made of it.
+    pub(crate) fn note(&self, level: &str, extent: UVec3) -> Option<String> {
         let [x, y, z] = self.begin.to_array();
-        (self.begin != I64Vec3::ZERO).then(|| {
-            format!(
+        if self.begin != I64Vec3::ZERO {
+            return Some(format!(
                 "its level {level} begins {x}, {y}, {z} of its voxels (x, y, z) from where the finest does, and is shown there"
+            ));
+        }
+        let size = self.size;
+        (size != extent).then(|| {
+            format!(
+                "its level {level} has {} x {} x {} voxels, and {} x {} x {} would cover the finest one: it is of a part, or of \
+                 more, or one of the two says a wrong size",
+                size.x, size.y, size.z, extent.x, extent.y, extent.z
             )
         })
     }
@@ -100,7 +109,7 @@ mod tests {
             assert_eq!(level.extent.to_array(), size);
             let all = VoxelBox::of_size(level.extent);
             assert_eq!(placed.part(all), Some((all, UVec3::ZERO)));
-            assert!(placed.note("1").is_none());
+            assert!(placed.note("1", level.extent).is_none());
         }
     }
 
@@ -109,7 +118,7 @@ mod tests {
         let placed = placed([10, 100, 4], [3.2, -7.0, 6.0]);
         let level = placed.level(FINEST, BY).unwrap();
         assert_eq!(level.extent, UVec3::new(26, 46, 9));
-        let note = placed.note("\"s1\"").unwrap();
+        let note = placed.note("\"s1\"", level.extent).unwrap();
         assert!(note.contains("\"s1\" begins 3, -7, 6 of"), "{note}");
         let part = |min: [u32; 3], max: [u32; 3]| {
             let part = placed.part(VoxelBox::new(min.into(), max.into()));
@@ -125,6 +134,25 @@ mod tests {
         );
         assert_eq!(part([0, 0, 0], [3, 45, 9]), None);
         assert_eq!(part([13, 0, 0], [25, 45, 9]), None);
+    }
+
+    #[test]
+    fn a_size_that_does_not_fit_is_told() {
+        // One that is twice as long as the others say, and one of a part.
+        for size in [[50, 45, 9], [25, 45, 4]] {
+            let placed = placed(size, [0.0; 3]);
+            let level = placed.level(FINEST, BY).unwrap();
+            let note = placed.note("\"s1\"", level.extent).unwrap();
+            let [x, y, z] = size;
+            let both = [
+                format!("\"s1\" has {x} x {y} x {z} voxels"),
+                format!(
+                    "{} x {} x {} would cover",
+                    level.extent.x, level.extent.y, level.extent.z
+                ),
+            ];
+            assert!(both.iter().all(|part| note.contains(part)), "{note}");
+        }
     }
 
     #[test]

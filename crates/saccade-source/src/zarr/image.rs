@@ -43,6 +43,7 @@ pub(super) struct LevelArray {
     grid: Vec<u64>,
     extent: UVec3,
     placed: Placed,
+    note: Option<String>,
     channels: u32,
     /// Values between neighbours along each axis of the array, in a decoded chunk.
     strides: Vec<usize>,
@@ -81,6 +82,7 @@ impl LevelArray {
             axes: axes.to_vec(),
             extent,
             placed: Placed::new(extent, DVec3::ZERO, 0.0),
+            note: None,
             channels,
             strides,
         })
@@ -95,17 +97,19 @@ impl LevelArray {
         downsampling: DVec3,
     ) -> Result<Level, Refusal> {
         self.placed = Placed::new(self.extent, corner, MEANT_OTHERWISE);
-        self.placed.level(finest, downsampling).ok_or_else(|| {
+        let level = self.placed.level(finest, downsampling).ok_or_else(|| {
             let path = &self.path;
             Refusal::Unsupported(format!(
                 "its level {path:?} lies elsewhere than the finest one (translation)"
             ))
-        })
+        })?;
+        self.note = self.placed.note(&format!("{:?}", self.path), level.extent);
+        Ok(level)
     }
 
     /// What a user should know of where it lies.
     pub(super) fn note(&self) -> Option<String> {
-        self.placed.note(&format!("{:?}", self.path))
+        self.note.clone()
     }
 
     pub(super) fn extent(&self) -> UVec3 {
@@ -262,10 +266,6 @@ impl ZarrImage {
             });
         }
         Ok(image)
-    }
-
-    pub(super) fn values(&self) -> &Values {
-        &self.values
     }
 
     /// About what a decoded chunk takes \[bytes\].
@@ -511,6 +511,10 @@ impl ZarrImage {
 impl Stored for ZarrImage {
     fn volume(&self) -> &Arc<Volume> {
         &self.volume
+    }
+
+    fn values(&self) -> &Values {
+        &self.values
     }
 
     fn placed(&self, level: u32) -> Placed {

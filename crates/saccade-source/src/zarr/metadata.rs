@@ -28,6 +28,8 @@ pub(super) struct Image {
     pub(super) has_size: bool,
     /// Finest voxels per voxel, by level, where transformations tell.
     pub(super) downsampling: Vec<Option<DVec3>>,
+    /// How far all of it is moved \[nm\].
+    pub(super) origin_nm: DVec3,
     /// Middle of each level's first voxel, from that of the finest's \[finest voxels\].
     pub(super) first: Vec<DVec3>,
     /// Channels, as far as anything is said of them.
@@ -58,6 +60,22 @@ pub(super) fn ome(attributes: &Value) -> &Value {
     // Version 0.5 has a name space of its own.
     let ome = &attributes["ome"];
     if ome.is_object() { ome } else { attributes }
+}
+
+/// Versions of OME-Zarr that are read as they are meant.
+const KNOWN: [&str; 6] = ["0.1", "0.2", "0.3", "0.4", "0.5", "0.6"];
+
+/// The version that an image says it is of: since 0.5 all of it, before that its multiscales.
+fn version(ome: &Value) -> Option<&str> {
+    { ome["version"].as_str() }.or_else(|| ome["multiscales"][0]["version"].as_str())
+}
+
+/// Whether it is one of those, or a draft of one, as `0.6-dev1` and `0.6.dev1`.
+fn is_known(version: &str) -> bool {
+    KNOWN.iter().any(|known| {
+        let rest = version.strip_prefix(known);
+        rest.is_some_and(|rest| !rest.starts_with(|c: char| c.is_ascii_digit()))
+    })
 }
 
 /// Paths of an image's levels, finest first.
@@ -147,17 +165,19 @@ impl Image {
         let placed: Vec<&Value> = placed.collect();
         let ways = placed.iter().map(|list| way(&axes, list));
         let ways: Vec<Way> = ways.collect::<Result<_, _>>()?;
-        // Where it moves all, it moves nothing here.
         let of_all = { space.of_all }.map(|transformations| way(&axes, transformations));
-        let of_all = { of_all.transpose()? }.and_then(|way| way.scale);
-        let of_all = of_all.unwrap_or(DVec3::ONE);
+        let of_all = of_all.transpose()?;
+        let moved = { of_all.as_ref() }.map_or(DVec3::ZERO, |way| way.first);
+        let of_all = { of_all.and_then(|way| way.scale) }.unwrap_or(DVec3::ONE);
         let begin = ways.first().map_or(DVec3::ZERO, |way| way.first);
         let finest = ways.first().and_then(|way| way.scale);
         let units = named.and_then(|named| units(named, &axes));
         let says_size = finest.is_some() || placed.first().is_some_and(|list| space::stays(list));
         let has_size = says_size && units.is_some();
         let finest = finest.unwrap_or(DVec3::ONE);
-        let mut voxel_nm = finest * of_all * units.unwrap_or(DVec3::splat(1e3));
+        let units = units.unwrap_or(DVec3::splat(1e3));
+        let mut voxel_nm = finest * of_all * units;
+        let origin_nm = (begin * of_all + moved) * units;
         if !axes.contains(&Axis::Space(2)) {
             voxel_nm.z = voxel_nm.x;
         }
@@ -165,18 +185,30 @@ impl Image {
             let reason = "its voxels have no size (coordinateTransformations)";
             return Err(Refusal::wrong(reason));
         }
+        if !origin_nm.is_finite() {
+            let reason = "it lies nowhere (coordinateTransformations)";
+            return Err(Refusal::wrong(reason));
+        }
         let downsampling = |way: &Way| Some(way.scale? / finest).filter(|d| d.is_finite());
         let channels = ome["omero"]["channels"].as_array().into_iter().flatten();
+        let mut notes = space.notes;
+        notes.extend(version(ome).filter(|version| !is_known(version)).map(|version| {
+            format!(
+                "it is of version {version:?} of OME-Zarr, and {} are known here: what newer ones say differently is \
+                 taken as those say it", KNOWN.join(", ")
+            )
+        }));
         Ok(Self {
             voxel_nm,
             has_size,
+            origin_nm,
             downsampling: ways.iter().map(downsampling).collect(),
             first: { ways.iter() }
                 .map(|way| (way.first - begin) / finest)
                 .collect(),
             channels: channels.map(channel).collect(),
             is_labels: ome["image-label"].is_object(),
-            notes: space.notes,
+            notes,
             axes,
         })
     }

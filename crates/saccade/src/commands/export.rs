@@ -42,12 +42,13 @@ fn region(text: &str) -> Result<VoxelBox, String> {
 /// interrupted goes on when it is begun again.
 #[derive(Args)]
 pub(crate) struct Export {
-    /// Address of a server, or a visualization archive: its folder, or s3://bucket/prefix with
-    /// --catalog; or the folder of an OME-Zarr image
+    /// Address of a server; or a visualization archive: its folder, or s3://bucket/prefix with
+    /// --catalog; or an OME-Zarr or precomputed image: its folder or address
     #[arg(value_name = "URL|ARCHIVE|IMAGE")]
     place: Place,
 
-    /// Where the image is to be: an empty or new folder, or s3://bucket/prefix
+    /// Where the image is to be: an empty or new folder, or s3://bucket/prefix; or where the same export
+    /// was begun
     #[arg(value_name = "OUT")]
     out: StorageLocation,
 
@@ -75,6 +76,11 @@ pub(crate) struct Export {
     #[arg(long, value_name = "LEVEL", default_value_t = 3, value_parser = clap::value_parser!(u8).range(0..=22))]
     compression: u8,
 
+    /// Let ids of labels above 65535 become other numbers, which several of them may share; without it, such an
+    /// export ends with an error
+    #[arg(long)]
+    rename_labels: bool,
+
     #[command(flatten)]
     stitching: Stitching,
 }
@@ -90,8 +96,15 @@ impl Export {
             channels: self.channels.map(|Channels(list)| list),
             finest: self.finest,
             compression: self.compression,
+            rename_labels: self.rename_labels,
             ..ExportOptions::default()
         };
+        if let Some(cut) = self
+            .region
+            .and_then(|region| cut(region, source.volume().extent()))
+        {
+            say(&cut);
+        }
         // Draws nothing where there is no terminal.
         let bar = ProgressBar::new(0).with_style(
             ProgressStyle::with_template("{bar:32} {pos}/{len} shards, {msg}, {eta} left")
@@ -113,9 +126,14 @@ impl Export {
         };
         bar.finish_and_clear();
         let done = match done {
-            Err(error @ (ExportError::Exists | ExportError::Other { .. })) => {
+            Err(
+                error @ (ExportError::Exists
+                | ExportError::Other { .. }
+                | ExportError::Outdated { .. }),
+            ) => {
                 bail!("{error}: {}", self.out)
             }
+            Err(error @ ExportError::Label { .. }) => bail!("{error} (--rename-labels)"),
             done => done?,
         };
         if let StorageLocation::Folder(folder) = &self.out {
@@ -127,7 +145,20 @@ impl Export {
     }
 }
 
+/// What to say of a region that reaches beyond the volume.
+fn cut(region: VoxelBox, extent: UVec3) -> Option<String> {
+    let part = region.intersection(VoxelBox::of_size(extent));
+    // What has nothing of the volume is refused.
+    (part != region && !part.is_empty()).then(|| {
+        let UVec3 { x, y, z } = part.max;
+        format!("the region reaches beyond the volume, and is cut at {x},{y},{z}")
+    })
+}
+
 fn summary(done: &ExportProgress, seconds: f64) -> String {
+    if done.was_whole {
+        return "nothing to do: this export is there, and whole".to_owned();
+    }
     let mut parts = vec![format!(
         "exported {} in {seconds:.0} s: {} shards",
         megabytes(done.bytes),
@@ -170,6 +201,16 @@ mod tests {
         ] {
             assert!(region(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn what_is_cut_is_told() {
+        let extent = UVec3::new(10, 20, 30);
+        let told = |text: &str| cut(region(text).unwrap(), extent);
+        assert_eq!(told("0,0,0,10,20,30"), None);
+        assert_eq!(told("10,0,0,11,20,30"), None, "refused elsewhere");
+        let words = told("1,2,3,10,21,400").unwrap();
+        assert!(words.ends_with("cut at 10,20,30"), "{words}");
     }
 
     #[test]

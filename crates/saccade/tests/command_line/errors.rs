@@ -7,7 +7,7 @@ use std::process::Output;
 use super::{Running, archive, done, run, saccade, simulate, stderr};
 
 /// Failed, in one report that holds all of `parts`.
-fn assert_failed(output: &Output, code: i32, parts: &[&str]) {
+pub(crate) fn assert_failed(output: &Output, code: i32, parts: &[&str]) {
     let text = stderr(output);
     assert_eq!(output.status.code(), Some(code), "{text}");
     assert_eq!(text.matches("error: ").count(), 1, "{text}");
@@ -25,7 +25,7 @@ fn assert_failed(output: &Output, code: i32, parts: &[&str]) {
     assert_eq!(lines.len(), all, "something is said twice: {text}");
 }
 
-fn text(path: &Path) -> &str {
+pub(crate) fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
@@ -647,8 +647,21 @@ fn what_an_export_finds_in_its_place() {
     let out = folder.path().join("out.zarr");
     let export = |more: &[&str]| run(["export", &archive, text(&out)].iter().chain(more));
     assert!(export(&[]).status.success());
-    let taken = export(&[]);
+    assert!(stderr(&done(["export", &archive, text(&out)])).contains("nothing to do"));
+    let taken = export(&["--channels", "0", "--compression", "0"]);
     assert_failed(&taken, 1, &["something already", text(&out)]);
+    let cut = folder.path().join("cut.zarr");
+    let told = stderr(&done([
+        "export",
+        &archive,
+        text(&cut),
+        "--region",
+        "0,0,0,100,100,9999",
+    ]));
+    assert!(
+        told.contains("reaches beyond the volume, and is cut at 100,100,12"),
+        "{told}"
+    );
 
     // As an export that was killed leaves it.
     std::fs::remove_file(out.join("zarr.json")).unwrap();

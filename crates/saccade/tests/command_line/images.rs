@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 
 use serde_json::json;
 
+use crate::errors::{assert_failed, text};
 use crate::{Running, run, saccade, stderr};
 
 /// Files on loopback, and who asked for which.
@@ -113,7 +114,27 @@ fn a_server_fetches_from_its_image_and_from_nowhere_else() {
     // Only chunks of z below 6 can be read; chunks of ours are 64 voxels deep, so that all end in an error that
     // is not the secret.
     let (status, body) = get("/v/image/zarr/0/c/0/0/0/0");
-    assert!(status >= 500 && !body.starts_with(&[7; 8]), "{status}");
+    assert_eq!(status, 424, "what others do not repeat");
+    let refusal: serde_json::Value = serde_json::from_slice(&body).unwrap();
+    let cause = refusal["cause"].as_str().unwrap();
+    assert!(
+        cause.contains("chunk [2, 0, 0] of level 0") && cause.contains("302 Found"),
+        "{cause}"
+    );
+    // A folder is shown as what describes it.
+    for (folder, described) in [
+        ("zarr/", "zarr.json"),
+        ("zarr2", ".zattrs"),
+        ("precomputed/", "info"),
+    ] {
+        let (status, json) = get(&format!("/v/image/{folder}"));
+        let folder = folder.trim_end_matches('/');
+        assert_eq!(
+            (status, json),
+            get(&format!("/v/image/{folder}/{described}"))
+        );
+        assert_eq!(status, 200);
+    }
     assert!(
         files
             .asked
@@ -160,6 +181,28 @@ fn a_server_fetches_from_its_image_and_from_nowhere_else() {
             path.starts_with("/data/image.zarr/"),
             "{path} is no part of the image"
         );
+    }
+}
+
+/// An image that should be there by its name is not missed as an archive.
+#[test]
+fn a_missing_image_is_missed_as_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = folder.path().join("cells.ome.zarr");
+    for made in [false, true] {
+        if made {
+            std::fs::create_dir(&image).unwrap();
+        }
+        for command in [
+            &["serve", text(&image), "--port", "0"][..],
+            &["export", text(&image), "out"],
+        ] {
+            assert_failed(
+                &run(command),
+                1,
+                &["no image that can be opened", text(&image)],
+            );
+        }
     }
 }
 

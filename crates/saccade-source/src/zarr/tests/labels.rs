@@ -82,6 +82,7 @@ fn wide_ids_are_not_merged() {
     said_to_be_labels(&folder);
     let source = open(&folder).unwrap();
     assert!(source.volume().kind.is_labels());
+    assert_eq!(source.renamed_label(), None, "nothing was read yet");
     let shown = read_all(&runtime(), &source);
     let ids = stored_ids(&folder);
     assert_eq!(shown.len(), ids.len());
@@ -93,6 +94,8 @@ fn wide_ids_are_not_merged() {
             assert_eq!(number, narrow, "what fits stays");
         }
     }
+    let renamed = source.renamed_label().unwrap();
+    assert!(renamed > 65_535 && numbers.contains_key(&renamed));
     let wide: Vec<u16> = { numbers.iter() }
         .filter(|(id, _)| **id > 65_535)
         .map(|(_, number)| *number)

@@ -95,6 +95,54 @@ fn levels_are_where_their_translations_say() {
     }
 }
 
+/// The place of the whole is that of its finest level, after what is done to all levels.
+#[test]
+fn where_the_whole_lies_is_kept() {
+    let at = DVec3::new(1000.0, -77.5, 8.0);
+    let levels = [
+        json!([scale(FINE), moved(at)]),
+        json!([scale(COARSE), moved(at + TOGETHER)]),
+    ];
+    let (folder, source) = placed(levels.clone());
+    let origin = source.unwrap().volume().origin_nm;
+    assert_eq!(origin, at * 1e3);
+    let mut of_all = attributes("zyx", 2);
+    for (level, ways) in levels.into_iter().enumerate() {
+        of_all["multiscales"][0]["datasets"][level]["coordinateTransformations"] = ways;
+    }
+    let (by, further) = (DVec3::new(2.0, 2.0, 3.0), DVec3::new(0.5, 0.0, -1.0));
+    of_all["multiscales"][0]["coordinateTransformations"] = json!([scale(by), moved(further)]);
+    write_attributes(folder.path(), Version::V3, &of_all);
+    let source = open(folder.path()).unwrap();
+    assert_eq!(source.volume().origin_nm, (at * by + further) * 1e3);
+    assert_eq!(source.volume().voxel_nm, FINE * by * 1e3);
+    let (_, still) = placed([json!([scale(FINE)]), json!([scale(COARSE)])]);
+    assert_eq!(still.unwrap().volume().origin_nm, DVec3::ZERO);
+}
+
+#[test]
+fn a_version_that_is_not_known_is_told() {
+    for (version, told) in [
+        ("0.5", false),
+        ("0.6.dev3", false),
+        ("0.6-dev1", false),
+        ("0.9", true),
+        ("0.41", true),
+        ("1.0", true),
+    ] {
+        let (folder, _) = placed([json!([scale(FINE)]), json!([scale(COARSE)])]);
+        let mut said = attributes("zyx", 2);
+        said["version"] = version.into();
+        write_attributes(folder.path(), Version::V3, &said);
+        let notes = open(folder.path()).unwrap().notes().join(" ");
+        assert_eq!(
+            notes.contains(&format!("version {version:?} of OME-Zarr")),
+            told,
+            "{version}: {notes}"
+        );
+    }
+}
+
 #[test]
 fn half_a_voxel_is_what_writers_mean_otherwise() {
     for by in [DVec3::ZERO, TOGETHER, TOGETHER * 2.0, TOGETHER * 3.0] {
