@@ -51,27 +51,21 @@ pub(crate) struct App {
     /// What scripts are told after each frame, as JSON.
     publish: Box<dyn Fn(String)>,
     /// What is done once the GPU is gone.
-    lost: Box<dyn Fn(Loss)>,
+    lost: Lost,
     revivals: Revivals,
     /// The GPU is gone, and [`Self::lost`] was told.
     is_lost: bool,
 }
 
-/// What is left of a window whose GPU is gone.
-#[derive(Clone, Debug)]
-pub(crate) struct Loss {
-    /// Of the window.
-    pub(crate) context: egui::Context,
-    /// Whether another device is worth a try: not where one after another is lost.
-    pub(crate) may_revive: bool,
-}
+/// Told of a window whose GPU is gone, and whether another device is worth a try: not where one after another is lost.
+pub(crate) type Lost = Box<dyn Fn(&egui::Context, bool)>;
 
 /// What surrounds the application.
 pub(crate) struct Surroundings {
     /// Given the status as JSON after each frame.
     pub(crate) publish: Box<dyn Fn(String)>,
     /// Called once when a GPU is gone.
-    pub(crate) lost: Box<dyn Fn(Loss)>,
+    pub(crate) lost: Lost,
     /// Where the state of the acquisition is asked for.
     pub(crate) acquisition: Option<AcquisitionReader>,
     /// What the user should know of how values are shown, in sentences.
@@ -183,21 +177,13 @@ impl App {
         Ok(())
     }
 
-    /// Whether the window ended since its device was lost.
-    pub(crate) fn is_lost(&self) -> bool {
-        self.is_lost
-    }
-
     /// Tells once that the device is lost; nothing is drawn with it any more.
     fn leave(&mut self, context: &egui::Context) {
         // What draws the user interface would fail at buffers that there are no more.
         context.graphics_mut(|layers| *layers = Default::default());
         if !std::mem::replace(&mut self.is_lost, true) {
             let may_revive = self.revivals.may_revive(self.start.elapsed());
-            (self.lost)(Loss {
-                context: context.clone(),
-                may_revive,
-            });
+            (self.lost)(context, may_revive);
         }
     }
 

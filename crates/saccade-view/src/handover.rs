@@ -72,12 +72,6 @@ impl Handover {
             left: self.app.clone(),
         })
     }
-
-    /// Whether the last window ended because its device was lost.
-    #[cfg(not(target_family = "wasm"))]
-    pub(crate) fn is_lost(&self) -> bool {
-        self.app.borrow().as_ref().is_some_and(App::is_lost)
-    }
 }
 
 #[cfg(test)]

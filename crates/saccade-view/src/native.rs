@@ -95,7 +95,7 @@ pub async fn run(spec: SourceSpec, options: ViewOptions) -> Result<(), ViewError
 struct Windows {
     title: String,
     handover: Handover,
-    /// What was known of the last window whose device was lost, and whether another is worth a try.
+    /// What was known of the last window, if it ended because its device was lost, and whether another is worth a try.
     lost: Rc<RefCell<Option<(ViewportInfo, bool)>>>,
 }
 
@@ -109,10 +109,10 @@ impl Windows {
         let told = lost.clone();
         let surroundings = Surroundings {
             publish: Box::new(|_| ()),
-            lost: Box::new(move |loss| {
-                let window = loss.context.input(|input| input.viewport().clone());
-                told.replace(Some((window, loss.may_revive)));
-                loss.context.send_viewport_cmd(egui::ViewportCommand::Close);
+            lost: Box::new(move |window, may_revive| {
+                let seen = window.input(|input| input.viewport().clone());
+                told.replace(Some((seen, may_revive)));
+                window.send_viewport_cmd(egui::ViewportCommand::Close);
             }),
             acquisition,
             // Whoever opened the image has told them.
@@ -133,8 +133,9 @@ impl Windows {
         around: impl Fn(Shown) -> Box<dyn eframe::App + 'a>,
     ) -> Result<(), ViewError> {
         loop {
+            let before = self.lost.take();
             let native = eframe::NativeOptions {
-                viewport: self.viewport(),
+                viewport: self.viewport(before.as_ref().map(|(window, _)| window)),
                 renderer: eframe::Renderer::Wgpu,
                 wgpu_options: wgpu_options(),
                 dithering: false,
@@ -144,23 +145,20 @@ impl Windows {
                 Ok(around(self.handover.window(context)?))
             });
             eframe::run_native("saccade", native, create).map_err(view_error)?;
-            if !self.handover.is_lost() {
-                return Ok(());
-            }
-            let may_revive = self.lost.borrow().as_ref().is_some_and(|(_, may)| *may);
-            if !may_revive {
-                return Err(ViewError::Lost);
+            match *self.lost.borrow() {
+                None => return Ok(()),
+                Some((_, false)) => return Err(ViewError::Lost),
+                Some((_, true)) => {}
             }
             log::warn!("the GPU was lost; going on with a new device");
         }
     }
 
-    /// Where the last window was, if there was one.
-    fn viewport(&self) -> egui::ViewportBuilder {
+    /// Where the window was whose device was lost, if there was one.
+    fn viewport(&self, before: Option<&ViewportInfo>) -> egui::ViewportBuilder {
         let usual = egui::vec2(1280.0, 800.0);
         let builder = egui::ViewportBuilder::default().with_title(&self.title);
-        let lost = self.lost.borrow();
-        let Some((before, _)) = lost.as_ref() else {
+        let Some(before) = before else {
             return builder.with_inner_size(usual);
         };
         let size = before.inner_rect.map_or(usual, |rect| rect.size());

@@ -90,9 +90,9 @@ async fn run(canvas_id: &str) -> Result<(), String> {
     let (tell, losses) = mpsc::unbounded();
     let surroundings = Surroundings {
         publish: Box::new(|json| STATUS.set(json)),
-        lost: Box::new(move |loss| {
+        lost: Box::new(move |_, may_revive| {
             // Somebody listens for as long as the page is open.
-            let _ = tell.unbounded_send(loss.may_revive);
+            let _ = tell.unbounded_send(may_revive);
         }),
         acquisition: opened.acquisition,
         notes: opened.notes,

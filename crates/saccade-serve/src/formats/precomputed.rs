@@ -162,12 +162,10 @@ mod tests {
         let info = info(&moved);
         for (index, level) in moved.levels.iter().enumerate() {
             let voxel_nm = moved.voxel_nm * level.downsampling;
-            let offset = (moved.origin_nm / voxel_nm).round().to_array();
-            assert_eq!(
-                info["scales"][index]["voxel_offset"],
-                json!(offset.map(|n| n as i64))
-            );
-            let [ox, oy, oz] = offset.map(|n| n as i64);
+            let offset = (moved.origin_nm / voxel_nm).round().as_i64vec3();
+            let said = &info["scales"][index]["voxel_offset"];
+            assert_eq!(said, &json!(offset.to_array()));
+            let [ox, oy, oz] = offset.to_array();
             for chunk in VoxelBox::of_size(moved.chunks(index)).iter() {
                 let min = (chunk * moved.chunk).as_i64vec3();
                 let max = (chunk * moved.chunk + moved.chunk)

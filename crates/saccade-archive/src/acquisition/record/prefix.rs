@@ -61,7 +61,11 @@ pub(super) struct Line {
 }
 
 /// Reads up to and including a line feed, but keeps no more than the longest sensible line.
-pub(super) fn read_line(file: &mut impl BufRead, text: &mut Vec<u8>, prefix: &mut Prefix) -> io::Result<Line> {
+pub(super) fn read_line(
+    file: &mut impl BufRead,
+    text: &mut Vec<u8>,
+    prefix: &mut Prefix,
+) -> io::Result<Line> {
     let mut line = Line {
         bytes: 0,
         ended: false,

@@ -1,7 +1,7 @@
 //! Records are read as they are appended.
 
 use std::fs::File;
-use std::io::{self, BufRead as _, BufReader, Seek as _, SeekFrom};
+use std::io::{self, BufReader, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use super::prefix::{HEAD, MAX_LINE, Prefix, read_line};

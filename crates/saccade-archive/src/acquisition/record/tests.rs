@@ -1,5 +1,8 @@
+use std::io::Write as _;
+
 use super::prefix::{HEAD, MAX_LINE};
 use super::*;
+use crate::acquisition::AcquisitionError;
 use glam::DVec2;
 
 fn tile(name: &str) -> Record {
@@ -90,9 +93,8 @@ fn a_broken_line_is_named_and_passed() {
     let good = serde_json::to_string(&tile("a")).unwrap();
     let singular = good.replace("[1.0,0.0,0.0,1.0,", "[0,0,0,0,");
     let long = "x".repeat(3 * MAX_LINE);
-    let text = format!(
-        "{good}\n\nnonsense\r\n{singular}\n{{\"record\":\"song\"}}\n{long}\n{good}\r\n"
-    );
+    let text =
+        format!("{good}\n\nnonsense\r\n{singular}\n{{\"record\":\"song\"}}\n{long}\n{good}\r\n");
     std::fs::write(folder.path().join(RecordReader::FILE), text).unwrap();
     let lines = RecordReader::new(folder.path(), Cursor::default())
         .read(99)

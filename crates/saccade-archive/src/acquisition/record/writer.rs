@@ -10,7 +10,7 @@ use crate::acquisition::AcquisitionError;
 /// The microscope's side: appends records.
 #[derive(Debug)]
 pub struct RecordWriter {
-    file: File,
+    pub(super) file: File,
     path: PathBuf,
 }
 
