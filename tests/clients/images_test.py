@@ -107,10 +107,17 @@ class Case(unittest.TestCase):
         """The levels [c, z, y, x] that Saccade finds in an image."""
         out = self.work / "out.zarr"
         shutil.rmtree(out, ignore_errors=True)
-        ran = subprocess.run([BIN, "export", image, out, "--compression", "0", *options], capture_output=True, text=True)
+        run = [BIN, "export", image, out, "--compression", "0", *options]
+        ran = subprocess.run(run, capture_output=True, text=True)
+        self.renamed = "ids such as" in ran.stderr
+        if self.renamed:
+            self.assertEqual(ran.returncode, 1, "ids that do not fit are not exported unasked")
+            shutil.rmtree(out)
+            ran = subprocess.run([*run, "--rename-labels"], capture_output=True, text=True)
         self.assertEqual(ran.returncode, 0, f"{image}: {ran.stderr}")
         group = zarr.open_group(out, mode="r", zarr_format=3)
         multiscale = group.attrs["ome"]["multiscales"][0]
+        self.transforms = [level["coordinateTransformations"] for level in multiscale["datasets"]]
         return [group[level["path"]][...] for level in multiscale["datasets"]]
 
     def same(self, image, *levels, options=()):
@@ -282,6 +289,14 @@ class Real(Case):
             options = ["--region", "0,0,0," + ",".join(map(str, end))] if end else []
             with self.subTest(name):
                 self.same(folder / name, *levels, options=options)
+                # Where the whole lies is kept; the middle of a voxel is half of it further than its corner.
+                resolution = np.array(scales[0]["resolution"])
+                for scale, transforms in zip(scales, self.transforms):
+                    moved = dict((one["type"], one) for one in transforms).get("translation", {}).get("translation", [0] * 4)
+                    corner = np.array(scales[0].get("voxel_offset", [0] * 3)) * resolution
+                    want = corner + (np.array(scale["resolution"]) - resolution) / 2
+                    np.testing.assert_allclose(moved[:0:-1], want, err_msg=f"{name}, {scale['key']}")
+                self.assertEqual(self.renamed, labels)
 
     def test_neuroglancer_s_images(self):
         folder = DATA / "neuroglancer-testdata/datasource/zarr/ome_zarr"

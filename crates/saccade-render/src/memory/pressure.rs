@@ -10,12 +10,15 @@ const MOST: f32 = 32.0;
 const ROOM: f32 = 0.5;
 /// Complete frames in a row before it is.
 const PATIENCE: u32 = 4;
+/// Frames for which what did not fit one view counts in those that follow it: while the camera moves, a level that does
+/// not fit is tried, and its bricks are loaded, once in so many frames.
+const REMEMBERED: u32 = 40;
 
 /// The level-of-detail bias that memory asks for.
 ///
 /// It rises one step when bricks found no room, once per frame that has seen the last rise. It falls
-/// one step when the picture is complete and leaves room enough for the step. What did not fit is
-/// remembered until the view changes, so that a still camera settles.
+/// one step when some pictures in a row are complete and leave room enough for the step, whether the camera moves or
+/// not. What did not fit is remembered as long as the view stays, so that a still camera settles, and a little longer.
 #[derive(Debug, Default)]
 pub(crate) struct Pressure {
     bias: f32,
@@ -23,8 +26,10 @@ pub(crate) struct Pressure {
     since: Frame,
     /// Something found no room since the last report.
     refused: bool,
-    /// The highest bias that did not fit this view.
+    /// The highest bias that did not fit this view, or one of those before it.
     too_fine: Option<f32>,
+    /// Frames after which that is forgotten, once the view is another.
+    forgotten_in: Option<u32>,
     complete: u32,
 }
 
@@ -41,8 +46,10 @@ impl Pressure {
 
     /// Another view: what did not fit the last one may fit this one.
     pub(crate) fn view_changed(&mut self) {
-        self.too_fine = None;
-        self.complete = 0;
+        // Views that follow each other do not put it off.
+        if self.too_fine.is_some() && self.forgotten_in.is_none() {
+            self.forgotten_in = Some(REMEMBERED);
+        }
     }
 
     /// A frame is known: whether it was complete, and which share of the slots it used.
@@ -55,16 +62,21 @@ impl Pressure {
         }
         self.complete = if complete { self.complete + 1 } else { 0 };
         if refused && !complete {
-            self.too_fine = Some(self.bias);
+            (self.too_fine, self.forgotten_in) = (Some(self.bias), None);
             self.change(self.bias + STEP, next);
             return true;
         }
+        self.forgotten_in = self.forgotten_in.map(|frames| frames.saturating_sub(1));
+        if self.forgotten_in == Some(0) {
+            (self.too_fine, self.forgotten_in) = (None, None);
+        }
         let finer = self.bias - STEP;
-        let may_fall = finer >= 0.0 && self.too_fine.is_none_or(|bias| finer > bias);
+        let known_too_fine = self.too_fine.is_some_and(|bias| finer <= bias);
+        let may_fall = finer >= 0.0 && !(known_too_fine && self.forgotten_in.is_none());
         if !(may_fall && complete && used < ROOM) {
             return false;
         }
-        if self.complete >= PATIENCE {
+        if self.complete >= PATIENCE && !known_too_fine {
             self.change(finer, next);
         }
         true
@@ -84,8 +96,16 @@ mod tests {
     /// Frames of a view whose working set at bias 0 is `size` times the memory, shrinking by
     /// `shrink` a level; returns the bias after each.
     fn frames(pressure: &mut Pressure, count: u64, size: f32, shrink: f32) -> Vec<f32> {
-        let frames = 1..=count;
-        let biases = frames.map(|frame| {
+        looks(pressure, count, size, shrink, false)
+    }
+
+    /// The same with a camera that moves, or stays.
+    fn looks(pressure: &mut Pressure, count: u64, size: f32, shrink: f32, moves: bool) -> Vec<f32> {
+        let first = pressure.since + 1;
+        let biases = (first..first + count).map(|frame| {
+            if moves {
+                pressure.view_changed();
+            }
             // In whole levels, as a distant view does: all of it changes at once.
             let used = size / shrink.powf(pressure.bias().floor());
             if used > 1.0 {
@@ -116,12 +136,27 @@ mod tests {
         let mut pressure = Pressure::default();
         frames(&mut pressure, 100, 50.0, 8.0);
         assert!(pressure.bias() >= 1.0);
-        let mut pressure = Pressure {
-            since: 0,
-            ..pressure
-        };
         pressure.view_changed();
         assert_eq!(frames(&mut pressure, 200, 0.1, 8.0).last(), Some(&0.0));
+    }
+
+    #[test]
+    fn falls_while_the_camera_moves() {
+        let mut pressure = Pressure::default();
+        looks(&mut pressure, 100, 50.0, 8.0, true);
+        assert!(pressure.bias() >= 1.0);
+        assert_eq!(looks(&mut pressure, 300, 0.1, 8.0, true).last(), Some(&0.0));
+    }
+
+    /// A level whose bricks fill four times the memory, while the next coarser one needs less than half of it.
+    #[test]
+    fn a_moving_camera_tries_what_does_not_fit_now_and_then_only() {
+        let mut pressure = Pressure::default();
+        looks(&mut pressure, 100, 4.0, 16.0, true);
+        let biases = looks(&mut pressure, 400, 4.0, 16.0, true);
+        let tried = biases.windows(2).filter(|pair| pair[1].floor() < pair[0].floor());
+        let tried = tried.count();
+        assert!((3..=400 / REMEMBERED as usize + 1).contains(&tried), "{tried} times: {biases:?}");
     }
 
     #[test]
