@@ -102,6 +102,9 @@ pub struct StitchedOptions {
     /// Memory for the coarsest levels of tiles' pyramids \[bytes\], 16 or 32 kB each: all that levels show whose
     /// voxels are larger than their pixels.
     pub thumbnail_bytes: u64,
+    /// Memory for the beginnings of pyramids that were read with their indices \[bytes\], until they are used once: coarse levels
+    /// lie there, and need no other read.
+    pub beginning_bytes: u64,
     /// Memory for where the tiles of sections lie \[bytes\]: about 300 for each tile of those looked at
     /// last.
     pub section_bytes: u64,
@@ -130,6 +133,7 @@ impl Default for StitchedOptions {
             sub_tile_bytes: 256 << 20,
             index_bytes: 64 << 20,
             thumbnail_bytes: 128 << 20,
+            beginning_bytes: 16 << 20,
             section_bytes: 256 << 20,
             interpolation: None,
             overlaps: Overlaps::NearestCentre,

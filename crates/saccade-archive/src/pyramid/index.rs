@@ -44,14 +44,27 @@ impl PyramidIndex {
     ///
     /// [`PyramidError::Storage`] and [`PyramidError::Broken`].
     pub async fn open(storage: &dyn Storage, name: &str) -> Result<Self, PyramidError> {
-        Ok(Self::open_with_bytes(storage, name).await?.0)
+        Ok(Self::open_with_beginning(storage, name).await?.0)
     }
 
-    /// The same, with the bytes that hold the index.
-    pub(super) async fn open_with_bytes(
+    /// The same, with all that was read: the file's first bytes, in which coarse levels follow the index.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::open`].
+    pub async fn open_with_beginning(
         storage: &dyn Storage,
         name: &str,
     ) -> Result<(Self, Bytes), PyramidError> {
+        let (index, bytes, _) = Self::open_with_bytes(storage, name).await?;
+        Ok((index, bytes))
+    }
+
+    /// The same, with how many of the bytes hold the index.
+    pub(super) async fn open_with_bytes(
+        storage: &dyn Storage,
+        name: &str,
+    ) -> Result<(Self, Bytes, usize), PyramidError> {
         let read = async |range| {
             let failed = |source| PyramidError::Storage {
                 source,
@@ -74,8 +87,8 @@ impl PyramidIndex {
         if (bytes.len() as u64) < len {
             return Err(broken(format!("it ends within its index of {len} bytes")));
         }
-        bytes.truncate(usize::try_from(len).unwrap_or(usize::MAX));
-        Ok((Self::parse(&bytes, name)?, bytes))
+        let len = usize::try_from(len).unwrap_or(usize::MAX);
+        Ok((Self::parse(&bytes, name)?, bytes, len))
     }
 
     /// Reads the index from bytes that begin a file and hold all of its index.

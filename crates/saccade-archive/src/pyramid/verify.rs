@@ -114,7 +114,9 @@ pub async fn verify_quickly(storage: &dyn Storage, name: &str) -> Result<Verifie
         source,
         name: name.to_owned(),
     };
-    let (index, head): (PyramidIndex, Bytes) = PyramidIndex::open_with_bytes(storage, name).await?;
+    let (index, mut head, len): (PyramidIndex, Bytes, usize) =
+        PyramidIndex::open_with_bytes(storage, name).await?;
+    head.truncate(len);
     let checksums = parse::checksums(&head, index.levels().len()).map_err(broken)?;
     let size = storage.size(name).await.map_err(failed)?;
     check_len(&index, head.len() as u64, size).map_err(broken)?;

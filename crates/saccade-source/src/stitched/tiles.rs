@@ -173,6 +173,12 @@ impl Weighter<SubTileKey, Bytes> for Bytewise {
     }
 }
 
+impl Weighter<u64, Bytes> for Bytewise {
+    fn weight(&self, _: &u64, beginning: &Bytes) -> u64 {
+        beginning.len() as u64 + 64
+    }
+}
+
 impl Weighter<Box<str>, Arc<Thumbnail>> for Bytewise {
     fn weight(&self, name: &Box<str>, thumbnail: &Arc<Thumbnail>) -> u64 {
         (thumbnail.memory() + name.len() + 64) as u64
@@ -196,6 +202,8 @@ pub(super) struct Tiles {
     pyramids: Cache<Box<str>, Arc<Pyramid>, Bytewise>,
     sub_tiles: Cache<SubTileKey, Bytes, Bytewise>,
     thumbnails: Cache<Box<str>, Arc<Thumbnail>, Bytewise>,
+    /// What was read with the indices of pyramids, by their serials, until it is used.
+    beginnings: Cache<u64, Bytes, Bytewise>,
     /// With what tells the archive from others.
     disk: Option<(DiskCache, Vec<u8>)>,
     from_disk: AtomicU64,
@@ -236,6 +244,11 @@ impl Tiles {
             thumbnails: Cache::with_weighter(
                 items(options.thumbnail_bytes, SUB_TILE_VOXELS),
                 options.thumbnail_bytes,
+                Bytewise,
+            ),
+            beginnings: Cache::with_weighter(
+                items(options.beginning_bytes, 192 << 10),
+                options.beginning_bytes,
                 Bytewise,
             ),
             disk,
@@ -287,8 +300,8 @@ impl Tiles {
 
     async fn open(&self, tile: &IndexedTile) -> Result<Arc<Pyramid>, StitchError> {
         let _turn = self.reads.acquire().await;
-        let opened = PyramidIndex::open(&*self.storage, &tile.pyramid).await;
-        let index = opened.map_err(|source| {
+        let opened = PyramidIndex::open_with_beginning(&*self.storage, &tile.pyramid).await;
+        let (index, beginning) = opened.map_err(|source| {
             let section = tile.section;
             StitchError::Tile { source, section }
         })?;
@@ -310,6 +323,7 @@ impl Tiles {
             });
         }
         let serial = self.next_serial.fetch_add(1, Ordering::Relaxed);
+        self.beginnings.insert(serial, beginning);
         Ok(Arc::new(Pyramid::new(index, serial)))
     }
 
@@ -377,10 +391,22 @@ impl Tiles {
                 None => missing.push(at),
             }
         }
+        if missing.is_empty() {
+            return Ok(fetched);
+        }
         let gap = self.storage.read_cost();
         let reads = pyramid.index.reads(level as usize, missing, gap);
         let name = pyramid.index.name();
+        // Whoever opened it wanted what comes next: this.
+        let beginning = self.beginnings.remove(&pyramid.serial);
+        let beginning = beginning.map_or(Bytes::new(), |(_, bytes)| bytes);
         let read = reads.iter().map(async |read| {
+            let [begin, end] = [read.range.start, read.range.end].map(usize::try_from);
+            if let (Ok(begin), Ok(end)) = (begin, end)
+                && end <= beginning.len()
+            {
+                return Ok(beginning.slice(begin..end));
+            }
             let _turn = self.reads.acquire().await;
             let bytes = self.storage.read(name, Some(read.range.clone())).await;
             bytes.map_err(|source| {

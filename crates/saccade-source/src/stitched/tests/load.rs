@@ -14,7 +14,7 @@ use tokio::sync::Semaphore;
 use super::fixture::{Fixture, tile};
 use super::run;
 use crate::stitched::{StitchedOptions, StitchedSource};
-use crate::{ChunkId, VolumeSource};
+use crate::{Chunk, ChunkId, VolumeSource};
 
 /// Lets so many reads through, counts those that are under way, and writes down what was asked for.
 #[derive(Debug)]
@@ -119,6 +119,8 @@ async fn row(storage: Arc<Turnstile>) -> Fixture {
 async fn open(fixture: &Fixture, builds: usize) -> StitchedSource {
     let options = StitchedOptions {
         builds,
+        // Each sub-tile is a read.
+        beginning_bytes: 0,
         ..StitchedOptions::default()
     };
     fixture.open_with(options).await
@@ -185,6 +187,36 @@ fn who_still_waits_keeps_the_reads() {
         });
         both.await.0.unwrap();
         assert_eq!(source.statistics().blocks_built, 1);
+    });
+}
+
+/// The index of a small pyramid, and all of its levels, come with one read; without room for that, with two.
+#[test]
+fn what_comes_with_an_index_is_not_read_again() {
+    run(async {
+        for (beginning_bytes, reads) in [(StitchedOptions::default().beginning_bytes, 1), (0, 2)] {
+            for level in [0, 1, 3] {
+                let turnstile = Turnstile::new();
+                turnstile.passes.add_permits(1000);
+                let fixture = row(turnstile.clone()).await;
+                let options = StitchedOptions {
+                    beginning_bytes,
+                    ..StitchedOptions::default()
+                };
+                let source = fixture.open_with(options).await;
+                let block = if level == 3 { 0 } else { 2 };
+                let got = source.read(chunk(level, block)).await.unwrap();
+                assert_ne!(got, Chunk::Empty);
+                let mut names = turnstile.names.lock().unwrap().clone();
+                names.retain(|name| name.starts_with("tiles/"));
+                let asked = names.len();
+                names.sort();
+                names.dedup();
+                assert_eq!(asked, reads * names.len(), "level {level}: {} tiles", names.len());
+                let other = open(&fixture, 2).await;
+                assert_eq!(other.read(chunk(level, block)).await.unwrap(), got);
+            }
+        }
     });
 }
 
