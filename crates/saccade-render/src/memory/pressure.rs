@@ -154,9 +154,14 @@ mod tests {
         let mut pressure = Pressure::default();
         looks(&mut pressure, 100, 4.0, 16.0, true);
         let biases = looks(&mut pressure, 400, 4.0, 16.0, true);
-        let tried = biases.windows(2).filter(|pair| pair[1].floor() < pair[0].floor());
+        let tried = biases
+            .windows(2)
+            .filter(|pair| pair[1].floor() < pair[0].floor());
         let tried = tried.count();
-        assert!((3..=400 / REMEMBERED as usize + 1).contains(&tried), "{tried} times: {biases:?}");
+        assert!(
+            (3..=400 / REMEMBERED as usize + 1).contains(&tried),
+            "{tried} times: {biases:?}"
+        );
     }
 
     #[test]

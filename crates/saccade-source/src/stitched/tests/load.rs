@@ -212,7 +212,12 @@ fn what_comes_with_an_index_is_not_read_again() {
                 let asked = names.len();
                 names.sort();
                 names.dedup();
-                assert_eq!(asked, reads * names.len(), "level {level}: {} tiles", names.len());
+                assert_eq!(
+                    asked,
+                    reads * names.len(),
+                    "level {level}: {} tiles",
+                    names.len()
+                );
                 let other = open(&fixture, 2).await;
                 assert_eq!(other.read(chunk(level, block)).await.unwrap(), got);
             }
