@@ -9,6 +9,40 @@ use super::error::StitchError;
 use super::resample::{Patch, Sample, averaged, most_frequent};
 use super::tiles::{Fetched, Tiles};
 
+/// Samples of a row of a level from one line's beginning to the next. Blocks begin there as well.
+const LINE: u32 = 512;
+
+/// Samples that are drawn along one line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Piece {
+    segment: Segment,
+    /// The line's first sample, by its number in the level.
+    first: UVec2,
+    /// Samples of the line before these.
+    skip: usize,
+}
+
+/// Cuts a segment where lines begin: at places that are the same whatever else is drawn.
+fn pieces(grid: &Grid, segment: Segment) -> impl Iterator<Item = Piece> + use<> {
+    let Segment { y, start, end } = segment;
+    let (left, row) = (grid.first.x, grid.first.y + y);
+    let lines = (left + start) / LINE..(left + end).div_ceil(LINE);
+    lines.map(move |line| {
+        let first = line * LINE;
+        let start = start.max(first.saturating_sub(left));
+        let segment = Segment {
+            y,
+            start,
+            end: end.min(first.saturating_add(LINE) - left),
+        };
+        Piece {
+            segment,
+            first: UVec2::new(first, row),
+            skip: (left + start - first) as usize,
+        }
+    })
+}
+
 /// Samples of a grid, `by` x `by` of each voxel, 0 where nothing is drawn yet.
 pub(super) struct Canvas<S> {
     grid: Grid,
@@ -55,23 +89,29 @@ impl<S: Sample> Canvas<S> {
         let decoded: Result<Vec<_>, StitchError> = fetched.into_par_iter().map(decode).collect();
         let patch = Patch::<S>::of_sub_tiles(candidate.size(), &decoded?);
         let along = candidate.pixels_along_x(&self.grid);
+        let interpolation = self.rules.interpolation;
         let mut row = Vec::new();
-        for segment in &part.segments {
-            let first = segment.y as usize * self.grid.size.x as usize;
-            let place = first + segment.start as usize..first + segment.end as usize;
-            let pixel = candidate.pixel(&self.grid, segment.start, segment.y);
-            let interpolation = self.rules.interpolation;
+        let grid = self.grid;
+        for segment in part.segments.iter().flat_map(|s| pieces(&grid, *s)) {
+            let Piece {
+                segment,
+                first,
+                skip,
+            } = segment;
+            let begin = segment.y as usize * grid.size.x as usize;
+            let place = begin + segment.start as usize..begin + segment.end as usize;
+            let line = (candidate.pixel_at(&grid, first), along);
             if self.rules.labels {
                 if let Some(there) = self.there.get_mut(place.clone()) {
                     there.fill(true);
                 }
-                patch.labels(pixel, along, &mut self.values[place]);
+                patch.labels_from(line, skip, &mut self.values[place]);
             } else if self.rules.overlaps == Overlaps::NearestCentre {
-                patch.sample(interpolation, pixel, along, &mut self.values[place]);
+                patch.sample_from(interpolation, line, skip, &mut self.values[place]);
             } else {
                 row.resize(place.len(), S::default());
-                patch.sample(interpolation, pixel, along, &mut row);
-                self.add(part, *segment, &row);
+                patch.sample_from(interpolation, line, skip, &mut row);
+                self.add(part, segment, &row);
             }
         }
         Ok(())
@@ -111,6 +151,46 @@ impl<S: Sample> Canvas<S> {
             1 => samples,
             by if self.rules.labels => most_frequent(&samples, &self.there, size, by),
             by => averaged(&samples, size, by),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec2;
+
+    #[test]
+    fn pieces_are_a_segment_cut_where_lines_begin() {
+        for (left, start, end) in [
+            (0, 0, 512),
+            (1024, 3, 511),
+            (1020, 0, 1100),
+            (7, 505, 506),
+            (7, 100, 505),
+        ] {
+            let grid = Grid {
+                first: UVec2::new(left, 30),
+                size: UVec2::new(2000, 9),
+                step: DVec2::ONE,
+            };
+            let mut next = start;
+            for piece in pieces(&grid, Segment { y: 4, start, end }) {
+                let Piece {
+                    segment,
+                    first,
+                    skip,
+                } = piece;
+                assert_eq!((segment.start, segment.y, first.y), (next, 4, 34));
+                assert_eq!(first.x % LINE, 0);
+                assert_eq!(
+                    u64::from(left + segment.start),
+                    u64::from(first.x) + skip as u64
+                );
+                assert!(segment.start < segment.end && left + segment.end <= first.x + LINE);
+                next = segment.end;
+            }
+            assert_eq!(next, end);
         }
     }
 }

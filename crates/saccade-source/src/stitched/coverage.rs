@@ -63,7 +63,12 @@ impl Grid {
 
     /// Where sample (x, y) sits \[level-0 voxels\].
     pub(super) fn point(&self, x: u32, y: u32) -> DVec2 {
-        ((self.first.as_dvec2() + DVec2::new(f64::from(x), f64::from(y))) + 0.5) * self.step
+        self.point_at(self.first + UVec2::new(x, y))
+    }
+
+    /// Where a sample sits, by its number in the whole level \[level-0 voxels\].
+    fn point_at(&self, number: UVec2) -> DVec2 {
+        (number.as_dvec2() + 0.5) * self.step
     }
 
     /// Corners of all samples \[level-0 voxels\].
@@ -111,7 +116,12 @@ impl Candidate {
 
     /// Position \[pixels of the level\] of a sample; pixel `i` covers `[i, i + 1)`.
     pub(super) fn pixel(&self, grid: &Grid, x: u32, y: u32) -> DVec2 {
-        self.tile.position(grid.point(x, y)) / f64::from(1_u32 << self.level)
+        self.pixel_at(grid, grid.first + UVec2::new(x, y))
+    }
+
+    /// The same of a sample by its number in the whole level, which the tile may be far from.
+    pub(super) fn pixel_at(&self, grid: &Grid, number: UVec2) -> DVec2 {
+        self.tile.position(grid.point_at(number)) / f64::from(1_u32 << self.level)
     }
 
     /// How far that position moves from one sample to the next.

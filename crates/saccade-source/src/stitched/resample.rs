@@ -149,20 +149,40 @@ impl<S: Sample> Patch<S> {
     /// `[i, i + 1)`\], less than one grey level off, and at least 1. All samples must lie in the image,
     /// and in sub-tiles the patch was made of, or in blank ones.
     pub fn sample(&self, interpolation: Interpolation, pixel: DVec2, along: DVec2, out: &mut [S]) {
-        let line = Line::new(pixel - 0.5 - self.origin, along);
+        self.sample_from(interpolation, (pixel, along), 0, out);
+    }
+
+    /// The same without the first `skip` samples, which may lie anywhere. The others are what they are with them, to the last
+    /// bit.
+    pub(super) fn sample_from(
+        &self,
+        interpolation: Interpolation,
+        line: (DVec2, DVec2),
+        skip: usize,
+        out: &mut [S],
+    ) {
+        let mut line = self.line(line);
+        if interpolation != Interpolation::Linear {
+            line.step(skip);
+        }
         match interpolation {
             Interpolation::Nearest => {
                 float::nearest(&self.values, self.width, line, S::of(1), out);
             }
             Interpolation::Cubic => float::cubic(&self.values, self.width, line, out),
-            Interpolation::Linear => S::interpolate(&self.values, self.width, line, out),
+            Interpolation::Linear => S::interpolate(&self.values, self.width, line, skip, out),
         }
     }
 
-    /// The labels of the pixels that samples along a line lie in, as they are, 0 included; see [`Self::sample`].
-    pub(super) fn labels(&self, pixel: DVec2, along: DVec2, out: &mut [S]) {
-        let line = Line::new(pixel - 0.5 - self.origin, along);
+    /// The labels of the pixels that samples along a line lie in, as they are, 0 included; see [`Self::sample_from`].
+    pub(super) fn labels_from(&self, line: (DVec2, DVec2), skip: usize, out: &mut [S]) {
+        let mut line = self.line(line);
+        line.step(skip);
         float::nearest(&self.values, self.width, line, S::default(), out);
+    }
+
+    fn line(&self, (pixel, along): (DVec2, DVec2)) -> Line {
+        Line::new(pixel - 0.5, self.origin, along)
     }
 }
 
@@ -231,6 +251,54 @@ mod tests {
     }
 
     proptest! {
+        /// What a sample is does not depend on where its line begins to be drawn, nor on what else of the image is at hand.
+        #[test]
+        fn a_line_is_the_same_wherever_it_begins(
+            degrees in prop_oneof![Just(0.0), -1e-7..1e-7, -0.2..0.2, -3.0..3.0, -180.0..180.0],
+            scale in prop_oneof![Just(1.0), 0.995..1.005, 0.5..2.0],
+            start in (0.0..1.0, 0.0..1.0),
+            skip in 0..90_usize,
+            length in 1..90_usize,
+            seed in any::<u64>(),
+        ) {
+            let size = UVec2::new(190, 170);
+            let pixels = crate::stitched::tests::noise(190, 170, seed);
+            let patch = Patch::of_image(&pixels, size);
+            let along = DVec2::from_angle(f64::to_radians(degrees)) * scale;
+            let start = DVec2::from(start) * (size.as_dvec2() - 0.01);
+            let inside = |n: &usize| {
+                let at = start + along * *n as f64;
+                at.cmpge(DVec2::splat(0.01)).all() && at.cmplt(size.as_dvec2() - 0.01).all()
+            };
+            let whole = (0..200).take_while(inside).count();
+            prop_assume!(whole > 0);
+            let skip = skip % whole;
+            let end = (skip + length).min(whole);
+            let line = patch.line((start, along));
+            let mut all = [vec![0; whole], vec![0; whole], vec![0; whole]];
+            let mut part = [vec![0; end - skip], vec![0; end - skip], vec![0; end - skip]];
+            for (out, skip) in [(&mut all, 0), (&mut part, skip)] {
+                line::interpolate(&patch.values, patch.width, line, skip, &mut out[0]);
+                line::gathered(&patch.values, patch.width, line, skip, &mut out[1]);
+                // Runs are for lines along which pixels lie almost as samples do.
+                if degrees.abs() <= 3.0 && (scale - 1.0).abs() < 0.01 {
+                    line::in_runs(&patch.values, patch.width, line, skip, &mut out[2]);
+                }
+            }
+            for (all, part) in all.iter().zip(&part) {
+                prop_assert_eq!(&all[skip..end], &part[..]);
+            }
+            let wide: Vec<u16> = pixels.iter().map(|v| u16::from(*v) * 251).collect();
+            let wide = Patch::of_image(&wide, size);
+            for interpolation in [Interpolation::Nearest, Interpolation::Linear, Interpolation::Cubic] {
+                let mut all = vec![0; whole];
+                wide.sample(interpolation, start, along, &mut all);
+                let mut part = vec![0; end - skip];
+                wide.sample_from(interpolation, (start, along), skip, &mut part);
+                prop_assert_eq!(&all[skip..end], &part[..]);
+            }
+        }
+
         /// Every way of sampling: runs, gathered, shifted, and all lengths of what is left over.
         #[test]
         fn is_less_than_a_level_off(

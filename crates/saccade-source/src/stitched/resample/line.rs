@@ -5,6 +5,10 @@
 //! weights change. Runs need no gathering. Where they would be short, pixels are gathered one by one,
 //! and only the arithmetic is shared. [`super::wide`] does the same faster where it can.
 //!
+//! What a sample is must not depend on where the line begins to be drawn, which other tiles decide: neighbours that
+//! come would change it a little, outside of where they are. So a line has a first sample, from which
+//! samples are counted and put into groups, and any of them may be the first one that is wanted.
+//!
 //! Weights along x have 8 bits, those along y 16, slopes at least 16: a result is less than one grey
 //! level from what is exact.
 
@@ -16,6 +20,8 @@ pub(super) const BITS: u32 = 32;
 const LONGEST_RUN: usize = 64;
 /// Lines whose runs are shorter on average are gathered.
 const SHORT_RUN: i64 = 20;
+/// Samples within which a line that is straight leaves no pixel's edge behind: more than are drawn in one piece.
+const STRAIGHT: i64 = 4096;
 
 type Lanes<T> = [T; LANES];
 
@@ -32,26 +38,26 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// The first sample, and the way from one to the next.
-    pub(super) fn new(at: glam::DVec2, along: glam::DVec2) -> Self {
+    /// The first sample, and the way from one to the next, in an image of which pixel `origin` is the first at hand. What
+    /// follows the point does not depend on that.
+    pub(super) fn new(at: glam::DVec2, origin: glam::DVec2, along: glam::DVec2) -> Self {
         #[expect(
             clippy::cast_possible_truncation,
             reason = "positions in an image in memory are small"
         )]
         let fixed = |v: f64| (v * (1_u64 << BITS) as f64).round() as i64;
         Self {
-            x: fixed(at.x),
-            y: fixed(at.y),
+            x: fixed(at.x) - fixed(origin.x),
+            y: fixed(at.y) - fixed(origin.y),
             dx: fixed(along.x),
             dy: fixed(along.y),
         }
     }
 
-    /// Whether as many samples lie as pixels do.
-    fn is_straight(&self, samples: usize) -> bool {
+    /// Whether samples lie as pixels do.
+    fn is_straight(&self) -> bool {
         let off = (self.dx - (1 << BITS)).abs().max(self.dy.abs());
-        let samples = i64::try_from(samples).unwrap_or(i64::MAX);
-        off.saturating_mul(samples) < (1 << BITS) / 10_000
+        off.saturating_mul(STRAIGHT) < (1 << BITS) / 10_000
     }
 
     /// The same, where each sample lies so near to a whole pixel from the last that all have the same
@@ -148,27 +154,42 @@ fn lerp_at(top: [u8; 2], bottom: [u8; 2], right: u16, wy: u16) -> u8 {
     ((sum.wrapping_add(128) >> 8) as u8).max(1)
 }
 
-/// Interpolates in an image, `width` pixels wide, with [`MARGIN`] bytes behind its end. All samples
-/// must lie between its pixels.
-pub(super) fn interpolate(values: &[u8], width: usize, mut line: Line, mut out: &mut [u8]) {
+/// Interpolates in an image, `width` pixels wide, with [`MARGIN`] bytes behind its end: sample `skip` of a line, and those
+/// after it. All of these must lie between its pixels.
+pub(super) fn interpolate(
+    values: &[u8],
+    width: usize,
+    mut line: Line,
+    skip: usize,
+    out: &mut [u8],
+) {
     let one = 1_i64 << BITS;
-    if line.is_straight(out.len()) {
+    if line.is_straight() {
         line = line.pixel_for_pixel();
     }
     let slips = (line.dx - one).abs() + line.dy.abs();
     if slips == 0 {
+        line.step(skip);
         return shifted(values, width, line, out);
     }
     #[cfg(target_arch = "x86_64")]
-    {
-        let done = super::wide::interpolate(values, width, line, out);
+    if super::wide::serves(values, line) {
+        let lead = skip % LANES;
+        line.step(skip - lead);
+        let before = if lead == 0 { 0 } else { LANES - lead };
+        let (first, rest) = out.split_at_mut(before.min(out.len()));
+        if lead > 0 {
+            group(values, width, line, lead, first);
+            line.step(LANES);
+        }
+        let done = super::wide::interpolate(values, width, line, rest);
         line.step(done);
-        out = &mut out[done..];
+        return gathered(values, width, line, 0, &mut rest[done..]);
     }
     if slips.saturating_mul(SHORT_RUN) < one {
-        in_runs(values, width, line, out);
+        in_runs(values, width, line, skip, out);
     } else {
-        gathered(values, width, line, out);
+        gathered(values, width, line, skip, out);
     }
 }
 
@@ -190,7 +211,13 @@ fn shifted(values: &[u8], width: usize, line: Line, out: &mut [u8]) {
     }
 }
 
-fn in_runs(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
+pub(super) fn in_runs(
+    values: &[u8],
+    width: usize,
+    mut line: Line,
+    mut skip: usize,
+    out: &mut [u8],
+) {
     let slopes = [rounded(line.dx - (1 << BITS)), rounded(line.dy)];
     let ramps = slopes.map(ramp);
     let stride = slopes.map(|slope| low(slope * LANES as i64));
@@ -198,12 +225,17 @@ fn in_runs(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
     while done < out.len() {
         let mut weights = line.weights();
         let stays = |n: usize| until_it_leaves(weights[n], slopes[n]);
-        let run = stays(0)
-            .min(stays(1))
-            .min(LONGEST_RUN)
-            .min(out.len() - done);
-        let mut at = line.pixel(width);
-        let end = done + run;
+        let run = stays(0).min(stays(1)).min(LONGEST_RUN);
+        // Runs that nobody wants are walked over, so that all begin where they always do.
+        if run <= skip {
+            skip -= run;
+            line.step(run);
+            continue;
+        }
+        let mut at = line.pixel(width).wrapping_add(skip);
+        weights = [0, 1].map(|n| weights[n].wrapping_add(low(slopes[n] * skip as i64)));
+        let end = (done + run - skip).min(out.len());
+        skip = 0;
         while done < end {
             let pixels = &values[at..at + width + MARGIN];
             let part = |from: usize| pixels[from..].first_chunk().expect("the margin");
@@ -240,30 +272,50 @@ fn lerp_run(
     }
 }
 
-pub(super) fn gathered(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
-    // Of 16 bits after the point, so that pixels and the lanes' weights agree; anew for each LANES.
+pub(super) fn gathered(
+    values: &[u8],
+    width: usize,
+    mut line: Line,
+    skip: usize,
+    mut out: &mut [u8],
+) {
+    let mut lead = skip % LANES;
+    line.step(skip - lead);
+    while !out.is_empty() {
+        let (to, rest) = out.split_at_mut((LANES - lead).min(out.len()));
+        group(values, width, line, lead, to);
+        line.step(LANES);
+        (lead, out) = (0, rest);
+    }
+}
+
+/// Lanes `lead` and following of the group that a line begins with.
+fn group(values: &[u8], width: usize, line: Line, lead: usize, out: &mut [u8]) {
+    // Of 16 bits after the point, so that pixels and the lanes' weights agree; anew for each group.
     let (dx, dy) = (rounded(line.dx), rounded(line.dy));
     let ramps = [dx, dy].map(ramp);
-    for out in out.chunks_mut(LANES) {
-        let (mut x, mut y) = (line.x >> (BITS - 16), line.y >> (BITS - 16));
-        let mut pairs = [[0_u16; LANES]; 2];
-        let [top, bottom] = &mut pairs;
-        for (top, bottom) in top.iter_mut().zip(bottom).take(out.len()) {
-            let at = whole(y, 16) * width + whole(x, 16);
-            let pixels = &values[at..at + width + 2];
-            *top = u16::from_le_bytes([pixels[0], pixels[1]]);
-            *bottom = u16::from_le_bytes([pixels[width], pixels[width + 1]]);
-            (x, y) = (x + dx, y + dy);
-        }
-        let weights = line.weights();
-        if let Some(to) = out.as_mut_array() {
-            lerp_pairs(&pairs, weights, &ramps, to);
-        } else {
-            let mut last = [0; LANES];
-            lerp_pairs(&pairs, weights, &ramps, &mut last);
-            out.copy_from_slice(&last[..out.len()]);
-        }
-        line.step(LANES);
+    let (mut x, mut y) = (line.x >> (BITS - 16), line.y >> (BITS - 16));
+    (x, y) = (x + dx * lead as i64, y + dy * lead as i64);
+    let mut pairs = [[0_u16; LANES]; 2];
+    let [top, bottom] = &mut pairs;
+    let lanes = lead..lead + out.len();
+    for (top, bottom) in top[lanes.clone()]
+        .iter_mut()
+        .zip(&mut bottom[lanes.clone()])
+    {
+        let at = whole(y, 16) * width + whole(x, 16);
+        let pixels = &values[at..at + width + 2];
+        *top = u16::from_le_bytes([pixels[0], pixels[1]]);
+        *bottom = u16::from_le_bytes([pixels[width], pixels[width + 1]]);
+        (x, y) = (x + dx, y + dy);
+    }
+    let weights = line.weights();
+    if let Some(to) = out.as_mut_array() {
+        lerp_pairs(&pairs, weights, &ramps, to);
+    } else {
+        let mut whole = [0; LANES];
+        lerp_pairs(&pairs, weights, &ramps, &mut whole);
+        out.copy_from_slice(&whole[lanes]);
     }
 }
 

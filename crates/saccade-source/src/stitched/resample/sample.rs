@@ -37,9 +37,9 @@ pub(in crate::stitched) mod sealed {
         /// To little-endian bytes.
         fn write(values: &[Self], to: &mut [u8]);
 
-        /// Interpolates linearly along a line, see [`super::line::interpolate`].
+        /// Interpolates linearly along a line from its sample `skip` on, see [`super::line::interpolate`].
         #[allow(private_interfaces, reason = "the trait is sealed")]
-        fn interpolate(values: &[Self], width: usize, line: Line, out: &mut [Self]);
+        fn interpolate(values: &[Self], width: usize, line: Line, skip: usize, out: &mut [Self]);
     }
 }
 
@@ -80,8 +80,8 @@ impl sealed::Arithmetic for u8 {
     }
 
     #[allow(private_interfaces, reason = "the trait is sealed")]
-    fn interpolate(values: &[Self], width: usize, line: Line, out: &mut [Self]) {
-        line::interpolate(values, width, line, out);
+    fn interpolate(values: &[Self], width: usize, line: Line, skip: usize, out: &mut [Self]) {
+        line::interpolate(values, width, line, skip, out);
     }
 }
 
@@ -126,7 +126,8 @@ impl sealed::Arithmetic for u16 {
     }
 
     #[allow(private_interfaces, reason = "the trait is sealed")]
-    fn interpolate(values: &[Self], width: usize, line: Line, out: &mut [Self]) {
+    fn interpolate(values: &[Self], width: usize, mut line: Line, skip: usize, out: &mut [Self]) {
+        line.step(skip);
         float::linear(values, width, line, out);
     }
 }

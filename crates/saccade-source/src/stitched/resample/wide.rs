@@ -21,13 +21,18 @@ const NEAR: i64 = 117_000;
 /// The steepest step for which 16 samples fit into lanes of 32 bits \[2^-16 pixels\].
 const FAR: i64 = 1 << 26;
 
-/// Interpolates as many samples as fit, see [`super::line::interpolate`]; returns how many: none where
-/// the processor cannot.
+/// Whether the processor, and what is fast here, serve a line in an image.
+pub(super) fn serves(values: &[u8], line: Line) -> bool {
+    let steepest = rounded(line.dx).abs().max(rounded(line.dy).abs());
+    steepest <= FAR && i32::try_from(values.len()).is_ok() && is_x86_feature_detected!("avx2")
+}
+
+/// Interpolates as many whole groups of samples as there are, see [`super::line::interpolate`]; returns how many samples:
+/// none where [`serves`] says so.
 pub(super) fn interpolate(values: &[u8], width: usize, line: Line, out: &mut [u8]) -> usize {
     let whole = out.len() / LANES * LANES;
     let (dx, dy) = (rounded(line.dx), rounded(line.dy));
-    let far = dx.abs().max(dy.abs()) > FAR || i32::try_from(values.len()).is_err();
-    if whole == 0 || far || !is_x86_feature_detected!("avx2") {
+    if whole == 0 || !serves(values, line) {
         return 0;
     }
     let out = &mut out[..whole];
@@ -255,17 +260,17 @@ mod tests {
                 at.cmpge(DVec2::splat(0.01)).all() && at.cmplt(room).all()
             };
             let length = (0..200).take_while(inside).count();
-            let line = Line::new(start, along);
+            let line = Line::new(start, DVec2::ZERO, along);
             let (mut wide, mut narrow) = (vec![0; length], vec![0; length]);
             let done = interpolate(&values, 190, line, &mut wide);
-            gathered(&values, 190, line, &mut narrow);
+            gathered(&values, 190, line, 0, &mut narrow);
             let has = is_x86_feature_detected!("avx2");
             prop_assert_eq!(done, if has { length / LANES * LANES } else { 0 });
             prop_assert_eq!(&wide[..done], &narrow[..done]);
             // The comparison can fail: a pixel further all is different.
             if done > 0 {
                 let mut other = vec![0; length];
-                gathered(&values[1..], 190, line, &mut other);
+                gathered(&values[1..], 190, line, 0, &mut other);
                 prop_assert_ne!(&other[..done], &wide[..done]);
             }
         }
