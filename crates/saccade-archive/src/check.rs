@@ -154,7 +154,8 @@ pub enum CheckError {
 ///
 /// Each tile's pyramid is read whole and decoded, and held against its checksums, its size, and its
 /// name; transforms and counts of the catalog are looked at, and objects that nothing names are
-/// listed. With [`CheckOptions::repair`], orphans of a safe age are deleted; a tile whose pyramid is
+/// listed. With [`CheckOptions::repair`], orphans of a safe age are deleted if they are of records that the catalog has
+/// read: others are of later ones, if the catalog is an older copy, or somebody's own. A tile whose pyramid is
 /// missing or damaged is given back to ingest if the acquisition still has its record and image,
 /// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
 /// damaged object: ingest replaces it. A folder in the place of a pyramid is found as damage and not repaired:
@@ -425,22 +426,62 @@ impl Check<'_> {
                 self.report.young += 1;
                 continue;
             }
-            let repair = if self.options.repair {
+            let origin = self.origin(&object.name).await?;
+            let repair = if self.options.repair && origin == Origin::Read {
                 self.archive.storage().delete(&object.name).await?;
                 Some(Repair::Deleted)
             } else {
                 None
+            };
+            let why = match origin {
+                Origin::Read => "",
+                Origin::Later => {
+                    ", which are of a record that the catalog has not read: if it is an older copy, `saccade ingest` goes on \
+                     from there; they are never deleted"
+                }
+                Origin::Foreign => {
+                    ", and they are no pyramid of this catalog's; they are never deleted"
+                }
             };
             self.report.findings.push(Finding {
                 kind: FindingKind::Orphan,
                 volume: None,
                 tile: None,
                 object: Some(object.name.clone()),
-                reason: format!("nothing names these {} bytes", object.size),
+                reason: format!("nothing names these {} bytes{why}", object.size),
                 repair,
             });
         }
         Ok(())
+    }
+}
+
+/// Where an object comes from that nothing names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Origin {
+    /// A record that the catalog has read: what came of it is entered, or will never be.
+    Read,
+    /// One that it has not read.
+    Later,
+    /// None of this catalog's volumes.
+    Foreign,
+}
+
+impl Check<'_> {
+    async fn origin(&self, object: &str) -> Result<Origin, CheckError> {
+        let parts: Vec<&str> = object.split('/').collect();
+        let ["tiles", volume, section, pyramid] = parts[..] else {
+            return Ok(Origin::Foreign);
+        };
+        let (Some(position), Ok(_)) = (position_of(pyramid), section.parse::<u32>()) else {
+            return Ok(Origin::Foreign);
+        };
+        match self.archive.catalog().cursor(volume).await {
+            Ok(read) if position < read.offset => Ok(Origin::Read),
+            Ok(_) => Ok(Origin::Later),
+            Err(CatalogError::UnknownVolume { .. }) => Ok(Origin::Foreign),
+            Err(error) => Err(error.into()),
+        }
     }
 }
 

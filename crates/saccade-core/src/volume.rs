@@ -89,6 +89,10 @@ pub struct Volume {
     /// within the volume do not know of it.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub origin_nm: DVec3,
+    /// How much further each level lies than the volume, as whoever wrote it says: by a part of its voxels, since they round, or
+    /// mean another point of a voxel \[nm\]. Not at all where nothing is said. Pictures do not know of it either.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub shifts_nm: Vec<DVec3>,
     /// Levels, finest first; at least one.
     pub levels: Vec<Level>,
     /// Chunk size of every level \[voxels of the level\].
@@ -176,6 +180,7 @@ impl Volume {
             looks: Vec::new(),
             voxel_nm,
             origin_nm: DVec3::ZERO,
+            shifts_nm: Vec::new(),
             levels: halving_levels(extent, voxel_nm),
             chunk: UVec3::new(64, 64, 32),
         })
@@ -184,6 +189,11 @@ impl Volume {
     /// How a channel is meant to be shown at first.
     pub fn look(&self, channel: usize) -> Look {
         self.looks.get(channel).copied().unwrap_or_default()
+    }
+
+    /// Where a level lies that begins where it should, and as far as whoever wrote it says \[nm\].
+    pub fn place_nm(&self, level: usize) -> DVec3 {
+        self.origin_nm + self.shifts_nm.get(level).copied().unwrap_or_default()
     }
 
     /// Size at level 0 \[voxels\].
@@ -286,9 +296,14 @@ mod tests {
             Volume::new("v", UVec3::new(1000, 900, 50), DVec3::new(4.0, 4.0, 40.0)).unwrap();
         let json = serde_json::to_string(&v).unwrap();
         assert_eq!(serde_json::from_str::<Volume>(&json).unwrap(), v);
-        let silent = !json.contains("looks") && !json.contains("origin");
+        let silent = ["looks", "origin", "shifts"]
+            .iter()
+            .all(|key| !json.contains(key));
         assert!(silent, "nothing is said: {json}");
         v.origin_nm = DVec3::new(-8.0, 0.5, 1e9);
+        v.shifts_nm = vec![DVec3::ZERO, DVec3::X];
+        assert_eq!(v.place_nm(1), DVec3::new(-7.0, 0.5, 1e9));
+        assert_eq!(v.place_nm(2), v.origin_nm);
         let look = Look {
             color: Some([1, 2, 3]),
             window: Some([0.25, 0.5]),

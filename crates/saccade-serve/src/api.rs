@@ -61,6 +61,10 @@ pub(crate) struct VolumeDocument {
     /// missing, not at all.
     #[serde(skip_serializing_if = "Option::is_none")]
     origin_nm: Option<[f64; 3]>,
+    /// How much further each level lies than that, as whoever wrote it says: by a part of its voxels, x, y, z, in nanometres;
+    /// where it is missing, not at all.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    shifts_nm: Vec<[f64; 3]>,
     /// Finest first.
     levels: Vec<LevelDocument>,
     /// Chunk size of every level, x, y, z, in its voxels.
@@ -110,6 +114,7 @@ impl From<&Volume> for VolumeDocument {
             channels: volume.channels.clone(),
             voxel_nm: volume.voxel_nm.to_array(),
             origin_nm: (volume.origin_nm != DVec3::ZERO).then(|| volume.origin_nm.to_array()),
+            shifts_nm: volume.shifts_nm.iter().map(DVec3::to_array).collect(),
             levels: volume.levels.iter().map(level).collect(),
             chunk: volume.chunk.to_array(),
         }
@@ -207,6 +212,10 @@ mod tests {
             volume.origin_nm = match kind {
                 VoxelKind::Intensity => DVec3::ZERO,
                 VoxelKind::Labels => DVec3::new(-4.0, 0.5, 1e9),
+            };
+            volume.shifts_nm = match kind {
+                VoxelKind::Intensity => Vec::new(),
+                VoxelKind::Labels => vec![DVec3::ZERO, DVec3::new(-2.0, 2.5, 0.0)],
             };
             let document = to_value(VolumeDocument::from(&volume)).unwrap();
             assert_eq!(document, to_value(&volume).unwrap());

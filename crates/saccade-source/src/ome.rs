@@ -20,14 +20,14 @@ pub struct Placed {
     pub first_nm: DVec3,
 }
 
-/// Where the levels of a volume lie: a voxel that averages several has its middle in theirs.
+/// Where the levels of a volume lie: a voxel that averages several has its middle in theirs, unless whoever wrote it says otherwise.
 pub fn placed(volume: &Volume) -> Vec<Placed> {
-    let levels = volume.levels.iter();
-    let placed = levels.map(|level| {
+    let levels = volume.levels.iter().enumerate();
+    let placed = levels.map(|(n, level)| {
         let voxel_nm = volume.voxel_nm * level.downsampling;
         Placed {
             voxel_nm,
-            first_nm: volume.origin_nm + (voxel_nm - volume.voxel_nm) / 2.0,
+            first_nm: volume.place_nm(n) + (voxel_nm - volume.voxel_nm) / 2.0,
         }
     });
     placed.collect()

@@ -34,7 +34,7 @@ use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
-use crate::stored::{Stored, StoredSource, volume_name};
+use crate::stored::{Stored, StoredSource, leave_out_zero_shifts, volume_name};
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 pub(crate) use decode::Packing;
 pub use error::PrecomputedError;
@@ -178,6 +178,9 @@ fn volume(name: &str, info: &Info) -> Result<Volume, Refusal> {
                 "its level {key:?} lies elsewhere than the finest one (voxel_offset)"
             ))
         })?);
+        let shift = scale.placed.off() * scale.resolution;
+        volume.shifts_nm.push(shift);
     }
+    leave_out_zero_shifts(&mut volume);
     Ok(volume)
 }

@@ -11,7 +11,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use glam::UVec3;
+use glam::{DVec3, UVec3};
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
@@ -239,6 +239,13 @@ impl<F: Stored> VolumeSource for StoredSource<F> {
     /// Nobody tells of changes in files.
     fn changes(&self) -> BoxStream<'static, Change> {
         Box::pin(futures::stream::pending())
+    }
+}
+
+/// Says nothing of how much further levels lie where none does.
+pub(crate) fn leave_out_zero_shifts(volume: &mut Volume) {
+    if volume.shifts_nm.iter().all(|shift| *shift == DVec3::ZERO) {
+        volume.shifts_nm.clear();
     }
 }
 

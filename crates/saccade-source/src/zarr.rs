@@ -56,7 +56,7 @@ use serde_json::Value;
 
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
-use crate::stored::{Stored, StoredSource, volume_name};
+use crate::stored::{Stored, StoredSource, leave_out_zero_shifts, volume_name};
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 use array::Array;
 use error::Refusal;
@@ -302,6 +302,8 @@ fn volume(name: &str, image: &Image, levels: &mut [LevelArray]) -> Result<Volume
         // The corner of all voxels, while transformations place the middle of one.
         let corner = (image.first[n] - (by - 1.0) / 2.0) / by;
         volume.levels.push(level.place(corner, extent, by)?);
+        volume.shifts_nm.push(level.off() * by * volume.voxel_nm);
     }
+    leave_out_zero_shifts(&mut volume);
     Ok(volume)
 }

@@ -68,6 +68,16 @@ impl Fixture {
             archive.catalog().commit_tile(VOLUME, &tile).await.unwrap();
             names.push(object);
         }
+        let read = Cursor {
+            offset: fs::metadata(acquisition.path().join(RecordReader::FILE))
+                .unwrap()
+                .len(),
+            line: u64::from(TILES),
+            seen: None,
+        };
+        let mut commit = archive.catalog().begin(VOLUME).await.unwrap();
+        commit.cursor(read).await.unwrap();
+        commit.finish().await.unwrap();
         Self {
             folder,
             acquisition,
@@ -201,9 +211,9 @@ async fn every_damage_is_found_and_named() {
         ),
         (
             "one that nobody names",
-            |f| fs::write(f.folder.path().join("tiles/v/stray.tif"), "stray").unwrap(),
+            |f| fs::write(f.folder.path().join("tiles/v/000000/stray-7.tif"), "stray").unwrap(),
             true,
-            &[(FindingKind::Orphan, "tiles/v/stray.tif")],
+            &[(FindingKind::Orphan, "tiles/v/000000/stray-7.tif")],
         ),
     ];
     for (what, damage, quickly, want) in kinds {
@@ -238,7 +248,7 @@ async fn young_objects_may_be_about_to_be_entered() {
 #[tokio::test]
 async fn repairs_touch_nothing_that_is_whole() {
     let fixture = Fixture::new().await;
-    let stray = fixture.folder.path().join("tiles/v/stray.tif");
+    let stray = fixture.folder.path().join("tiles/v/000000/stray-7.tif");
     fs::write(&stray, "stray").unwrap();
     fs::write(fixture.path(1), "damaged").unwrap();
     fs::remove_file(fixture.path(4)).unwrap();
@@ -278,6 +288,48 @@ async fn repairs_touch_nothing_that_is_whole() {
         fixture.archive.catalog().entry(VOLUME).await.unwrap().tiles,
         6
     );
+}
+
+/// What a later catalog names is not deleted with an older copy of it, and what is somebody's own not at all.
+#[tokio::test]
+async fn what_this_catalog_cannot_know_is_never_deleted() {
+    let fixture = Fixture::new().await;
+    let tiles = fixture.folder.path().join("tiles");
+    let put = |name: &str| {
+        let path = tiles.join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, "something").unwrap();
+        path
+    };
+    let later = ["v/000000/t9-ffff.tif", "v/000003/t9-again2-fffff.tif"].map(put);
+    let foreign = [
+        "v/notes.txt",
+        "v/000000/notes-7.txt",
+        "v/x/t-7.tif",
+        "other/000000/t0-0.tif",
+        "t0-0.tif",
+    ]
+    .map(put);
+    let options = CheckOptions {
+        repair: true,
+        safe_age: Duration::ZERO,
+        ..CheckOptions::default()
+    };
+    let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+    let told = |words: &str| {
+        report
+            .findings
+            .iter()
+            .filter(|f| f.reason.contains(words))
+            .count()
+    };
+    assert_eq!(
+        (told("older copy"), told("no pyramid of this")),
+        (later.len(), foreign.len())
+    );
+    assert_eq!(report.findings.len(), later.len() + foreign.len());
+    assert!(report.findings.iter().all(|f| f.repair.is_none()));
+    assert!(later.iter().chain(&foreign).all(|path| path.exists()));
 }
 
 #[tokio::test]

@@ -26,13 +26,16 @@ pub struct SubTileRead {
 
 /// A pyramid's index: where its sub-tiles are, and the ranges of their values.
 ///
-/// Cheap to clone. Takes 24 bytes per sub-tile.
+/// Cheap to clone. Takes 28 bytes per sub-tile.
 #[derive(Clone, Debug)]
 pub struct PyramidIndex {
     name: Arc<str>,
     levels: Arc<[PyramidLevel]>,
     /// Row by row, for each level.
     entries: Arc<[Vec<SubTileEntry>]>,
+    /// In the same order; `None` for a file from before there were any.
+    checksums: Option<Arc<[Vec<u32>]>>,
+    mistaken: bool,
     jpeg_tables: Option<Arc<[u8]>>,
     dtype: Dtype,
 }
@@ -99,21 +102,29 @@ impl PyramidIndex {
     pub fn parse(bytes: &[u8], name: &str) -> Result<Self, PyramidError> {
         let described = parse::index_len(bytes).and_then(|len| {
             let index = usize::try_from(len).ok().and_then(|len| bytes.get(..len));
-            parse::describe(index.ok_or("it ends within its index")?)
+            let index = index.ok_or("it ends within its index")?;
+            let described = parse::describe(index)?;
+            let checksums = parse::checksums(index, described.levels.len())?;
+            let made_for = parse::name_checksum(index);
+            Ok((described, checksums, made_for))
         });
+        let (described, checksums, made_for) =
+            described.map_err(|reason| PyramidError::Broken {
+                reason,
+                name: name.to_owned(),
+            })?;
         let Description {
             levels,
             jpeg_tables,
             dtype,
-        } = described.map_err(|reason| PyramidError::Broken {
-            reason,
-            name: name.to_owned(),
-        })?;
+        } = described;
         let (levels, entries): (Vec<_>, Vec<_>) = levels.into_iter().unzip();
         Ok(Self {
             name: name.into(),
             levels: levels.into(),
             entries: entries.into(),
+            checksums: checksums.map(Into::into),
+            mistaken: made_for.is_some_and(|own| own != crc32fast::hash(name.as_bytes())),
             jpeg_tables: jpeg_tables.map(Into::into),
             dtype,
         })
@@ -122,6 +133,16 @@ impl PyramidIndex {
     /// The object the index was read from.
     pub fn name(&self) -> &str {
         &self.name
+    }
+
+    /// Whether it says that it was made for an object of another name: that of another tile.
+    pub fn is_mistaken(&self) -> bool {
+        self.mistaken
+    }
+
+    /// Checksums of the sub-tiles of each level, row by row; `None` for a file from before there were any.
+    pub(super) fn checksums(&self) -> Option<&[Vec<u32>]> {
+        self.checksums.as_deref()
     }
 
     /// Type of the voxels.
@@ -159,7 +180,7 @@ impl PyramidIndex {
     pub fn memory(&self) -> usize {
         let entries: usize = self.entries.iter().map(Vec::len).sum();
         size_of::<Self>()
-            + entries * size_of::<SubTileEntry>()
+            + entries * (size_of::<SubTileEntry>() + size_of::<u32>())
             + self.levels.len() * (size_of::<PyramidLevel>() + size_of::<Vec<()>>())
             + self.jpeg_tables.as_ref().map_or(0, |tables| tables.len())
             + self.name.len()
@@ -216,7 +237,7 @@ impl PyramidIndex {
     }
 
     /// Decodes a sub-tile from the bytes its entry names to [`SUB_TILE_VOXELS`] values, x fastest, as
-    /// little-endian bytes of [`PyramidIndex::dtype`]. The bytes of a blank one do not matter.
+    /// little-endian bytes of [`PyramidIndex::dtype`], if they have their checksum. The bytes of a blank one do not matter.
     ///
     /// # Errors
     ///
@@ -265,9 +286,16 @@ impl PyramidIndex {
             to.fill(0);
             return Ok(());
         }
-        let decoded = match &self.jpeg_tables {
-            Some(tables) => codec::decode_jpeg(tables, bytes, to),
-            None => codec::decode_lossless(self.dtype, bytes, to),
+        let at = y as usize * self.levels[level].sub_tiles.x as usize + x as usize;
+        let known = { self.checksums.as_ref() }.map(|all| all[level].get(at));
+        // A bit that changed on a disk may decode to something else without a word.
+        let decoded = if known.is_some_and(|known| known != Some(&crc32fast::hash(bytes))) {
+            Err("it does not have its checksum".to_owned())
+        } else {
+            match &self.jpeg_tables {
+                Some(tables) => codec::decode_jpeg(tables, bytes, to),
+                None => codec::decode_lossless(self.dtype, bytes, to),
+            }
         };
         decoded.map_err(|reason| PyramidError::Broken {
             reason: format!("sub-tile {x}, {y} of level {level}: {reason}"),

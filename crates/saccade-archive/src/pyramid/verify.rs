@@ -40,11 +40,6 @@ pub fn named(file: Bytes, name: &str) -> Result<Bytes, PyramidError> {
     Ok(file.freeze())
 }
 
-fn is_mistaken(index: &[u8], name: &str) -> bool {
-    let own = parse::name_checksum(index);
-    own.is_some_and(|own| own != crc32fast::hash(name.as_bytes()))
-}
-
 /// Reads a pyramid to its last byte: description and every sub-tile, each held against its checksum
 /// and decoded. Runs for a second per gigapixel; call it where that may be.
 ///
@@ -60,7 +55,7 @@ pub fn verify(bytes: &[u8], name: &str) -> Result<Verified, PyramidError> {
     let len = parse::index_len(bytes).map_err(broken)?;
     let head = usize::try_from(len).ok().and_then(|len| bytes.get(..len));
     let head = head.ok_or_else(|| broken("it ends within its index".to_owned()))?;
-    let checksums = parse::checksums(head, index.levels().len()).map_err(broken)?;
+    let checksums = index.checksums();
     check_len(&index, len, bytes.len() as u64).map_err(broken)?;
     // Other tools read it for every blank sub-tile.
     let end = index.begin().and_then(|at| usize::try_from(at).ok());
@@ -72,7 +67,7 @@ pub fn verify(bytes: &[u8], name: &str) -> Result<Verified, PyramidError> {
             for x in 0..size.sub_tiles.x {
                 let at = y as usize * size.sub_tiles.x as usize + x as usize;
                 let is_right = |checksum| {
-                    let known = checksums.as_ref().map(|all| all[level].get(at));
+                    let known = checksums.map(|all| all[level].get(at));
                     known.is_none_or(|known| known == Some(&checksum))
                 };
                 let what = |wrong| broken(format!("sub-tile {x}, {y} of level {level} {wrong}"));
@@ -93,9 +88,9 @@ pub fn verify(bytes: &[u8], name: &str) -> Result<Verified, PyramidError> {
         }
     }
     Ok(Verified {
-        index,
         checksums: checksums.is_some(),
-        mistaken: is_mistaken(head, name),
+        mistaken: index.is_mistaken(),
+        index,
     })
 }
 
@@ -117,13 +112,12 @@ pub async fn verify_quickly(storage: &dyn Storage, name: &str) -> Result<Verifie
     let (index, mut head, len): (PyramidIndex, Bytes, usize) =
         PyramidIndex::open_with_bytes(storage, name).await?;
     head.truncate(len);
-    let checksums = parse::checksums(&head, index.levels().len()).map_err(broken)?;
     let size = storage.size(name).await.map_err(failed)?;
     check_len(&index, head.len() as u64, size).map_err(broken)?;
     Ok(Verified {
+        checksums: index.checksums().is_some(),
+        mistaken: index.is_mistaken(),
         index,
-        checksums: checksums.is_some(),
-        mistaken: is_mistaken(&head, name),
     })
 }
 

@@ -8,15 +8,16 @@ use std::time::{Duration, SystemTime};
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
 use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord};
-use saccade_archive::catalog::{NewTile, Quarantined, Waiting, place};
+use saccade_archive::catalog::{Catalog, NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
 use saccade_archive::storage::{Storage, StorageError};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, VoxelKind};
 
-use super::IngestError;
+use super::enter::retry;
 use super::images::Images;
+use super::{IngestError, IngestOptions};
 use crate::progress::Progress;
 use crate::watch::BEFORE_FIRST;
 
@@ -143,7 +144,8 @@ pub(super) struct Context<'a> {
     pub(super) channels: &'a [String],
     pub(super) stored: Stored,
     pub(super) storage: &'a dyn Storage,
-    pub(super) retry: Duration,
+    pub(super) catalog: &'a Catalog,
+    pub(super) options: &'a IngestOptions,
     pub(super) progress: &'a dyn Progress,
 }
 
@@ -233,7 +235,7 @@ impl Context<'_> {
             let reason = format!("the volume has no such channel; it has {channels:?}: {mend}");
             return refused(reason, bytes);
         };
-        let name = pyramid_name(self.volume, &record, position);
+        let name = self.unused_name(&record, position).await?;
         let pyramid = {
             let (path, record, stored) = (path.clone(), record.clone(), self.stored);
             let work = move || build(&path, &record, stored, watched);
@@ -291,6 +293,15 @@ impl Context<'_> {
         Ok(Outcome::Tile { tile, pixels })
     }
 
+    /// A name for the pyramid of a record that no entered pyramid has: one that is made anew, since it was damaged, is
+    /// another, so that whoever has kept something of the damaged one does not take it for this.
+    async fn unused_name(&self, record: &TileRecord, position: u64) -> Result<String, IngestError> {
+        let entered = || self.catalog.tile(self.volume, &record.tile);
+        let entered = retry(self.options, self.progress, entered).await?;
+        let attempt = entered.map_or(0, |tile| attempt_after(&tile.pyramid, position));
+        Ok(pyramid_name(self.volume, record, position, attempt))
+    }
+
     /// Writes a pyramid; waits as long as the disk is full or the object store away. Where something else has its
     /// name, and always will, that is told.
     async fn write(
@@ -299,7 +310,7 @@ impl Context<'_> {
         name: &str,
         pyramid: Bytes,
     ) -> Result<Result<(), StorageError>, IngestError> {
-        let mut backoff = Backoff::new(self.retry);
+        let mut backoff = Backoff::new(self.options.retry);
         loop {
             match self.storage.write_durable(name, pyramid.clone()).await {
                 Ok(()) => {
@@ -399,8 +410,14 @@ pub(super) fn quarantine(
 }
 
 /// The pyramid's name in the storage: the same for the same record, another for another record of
-/// the same tile, so that a pyramid that is being read is never written to.
-pub(super) fn pyramid_name(volume: &str, record: &TileRecord, position: u64) -> String {
+/// the same tile, so that a pyramid that is being read is never written to; of a record whose pyramid is made anew, with the
+/// number of that attempt.
+pub(super) fn pyramid_name(
+    volume: &str,
+    record: &TileRecord,
+    position: u64,
+    attempt: u32,
+) -> String {
     let plain = |c: char| {
         if c.is_ascii_alphanumeric() || "-_".contains(c) {
             c
@@ -409,10 +426,26 @@ pub(super) fn pyramid_name(volume: &str, record: &TileRecord, position: u64) -> 
         }
     };
     let tile: String = record.tile.chars().take(100).map(plain).collect();
+    let attempt = match attempt {
+        0 => String::new(),
+        attempt => format!("-again{attempt}"),
+    };
     format!(
-        "tiles/{volume}/{:06}/{tile}-{position:x}.tif",
+        "tiles/{volume}/{:06}/{tile}{attempt}-{position:x}.tif",
         record.section
     )
+}
+
+/// The attempt that follows the one of which a pyramid of this name is; 0 if it is of another record.
+fn attempt_after(pyramid: &str, position: u64) -> u32 {
+    let end = format!("-{position:x}.tif");
+    let Some(before) = pyramid.strip_suffix(&end) else {
+        return 0;
+    };
+    let attempt = before
+        .rsplit_once("-again")
+        .and_then(|(_, n)| n.parse().ok());
+    attempt.unwrap_or(0_u32).saturating_add(1)
 }
 
 /// Pauses between attempts: doubling, up to sixteen times the first. What is waited out, however long, is looked
@@ -523,7 +556,10 @@ mod tests {
         ];
         let mut names: Vec<_> = (0..)
             .zip(wild)
-            .flat_map(|(n, tile)| [n, n + 100].map(|at| pyramid_name("v.1", &record(tile), at)))
+            .flat_map(|(n, tile)| {
+                let again = [(n, 0), (n, 1), (n, 2), (n + 100, 0)];
+                again.map(|(at, attempt)| pyramid_name("v.1", &record(tile), at, attempt))
+            })
             .collect();
         for name in &names {
             check_name(name).unwrap();
@@ -531,6 +567,11 @@ mod tests {
         }
         names.sort();
         names.dedup();
-        assert_eq!(names.len(), 2 * wild.len());
+        assert_eq!(names.len(), 4 * wild.len());
+        for attempt in 0..12 {
+            let name = pyramid_name("v", &record("a-b"), 0x7a, attempt);
+            assert_eq!(attempt_after(&name, 0x7a), attempt + 1, "{name}");
+            assert_eq!(attempt_after(&name, 0x17a), 0, "another record");
+        }
     }
 }

@@ -68,7 +68,7 @@ fn offset(volume: &Volume, level: usize) -> I64Vec3 {
     let voxel_nm = volume.voxel_nm * volume.levels[level].downsampling;
     // Far from the ends of what can be counted, so that corners can be added.
     let far = f64::from(1 << 30) * f64::from(1 << 20);
-    (volume.origin_nm / voxel_nm)
+    (volume.place_nm(level) / voxel_nm)
         .round()
         .clamp(glam::DVec3::splat(-far), glam::DVec3::splat(far))
         .as_i64vec3()

@@ -48,6 +48,14 @@ pub enum StitchError {
         /// The file.
         name: String,
     },
+    /// A tile's pyramid is that of another tile.
+    #[error(
+        "the pyramid was made for another tile; `saccade check ARCHIVE --repair` has it made anew: {name}"
+    )]
+    Mistaken {
+        /// The file.
+        name: String,
+    },
     /// A tile's pyramid is shorter than its index says.
     #[error(
         "the pyramid ends early; append the tile's record to its acquisition \
@@ -81,9 +89,11 @@ impl StitchError {
                 other => format!("{self}: {}: {name}", other.without_place()),
             },
             Self::Tile { source, .. } => format!("{self}: {source}"),
-            Self::Size { .. } | Self::Dtype { .. } | Self::Cut { .. } | Self::Stopped { .. } => {
-                self.to_string()
-            }
+            Self::Size { .. }
+            | Self::Dtype { .. }
+            | Self::Mistaken { .. }
+            | Self::Cut { .. }
+            | Self::Stopped { .. } => self.to_string(),
         }
     }
 
@@ -95,7 +105,11 @@ impl StitchError {
                 source: PyramidError::Storage { source, .. },
                 ..
             } => !source.is_outage(),
-            Self::Tile { .. } | Self::Size { .. } | Self::Dtype { .. } | Self::Cut { .. } => true,
+            Self::Tile { .. }
+            | Self::Size { .. }
+            | Self::Dtype { .. }
+            | Self::Mistaken { .. }
+            | Self::Cut { .. } => true,
             Self::Catalog { .. } | Self::Stopped { .. } => false,
         }
     }
@@ -106,9 +120,11 @@ impl StitchError {
             Self::Catalog { source } => source.is_transient(),
             // A file that is not there may be on its way; the catalog named it.
             Self::Tile { source, .. } => matches!(source, PyramidError::Storage { .. }),
-            Self::Size { .. } | Self::Dtype { .. } | Self::Cut { .. } | Self::Stopped { .. } => {
-                false
-            }
+            Self::Size { .. }
+            | Self::Dtype { .. }
+            | Self::Mistaken { .. }
+            | Self::Cut { .. }
+            | Self::Stopped { .. } => false,
         }
     }
 }

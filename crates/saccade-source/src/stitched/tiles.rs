@@ -305,6 +305,11 @@ impl Tiles {
             let section = tile.section;
             StitchError::Tile { source, section }
         })?;
+        if index.is_mistaken() {
+            return Err(StitchError::Mistaken {
+                name: tile.pyramid.to_string(),
+            });
+        }
         let got = UVec2::new(index.levels()[0].width, index.levels()[0].height);
         let levels = index.levels().len();
         if index.dtype() != self.dtype {

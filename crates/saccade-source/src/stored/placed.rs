@@ -5,10 +5,12 @@ use saccade_core::levels::Level;
 use saccade_core::voxel_box::VoxelBox;
 
 /// Where a stored array begins in the level that it is of, and how large it is \[voxels of the level\].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Placed {
     begin: I64Vec3,
     size: UVec3,
+    /// How much further it lies than its voxels are put.
+    off: DVec3,
 }
 
 impl Placed {
@@ -25,10 +27,20 @@ impl Placed {
             let is_none = voxels.is_nan() || voxels.abs() <= slack;
             if is_none { 0 } else { whole }
         });
+        let begin = I64Vec3::from(begin);
+        // What is left of a division is nothing that anybody said.
+        let said = |off: f64| off.abs() > 1e-6 && off.abs() <= 1.0;
+        let off = (corner - begin.as_dvec3()).to_array();
         Self {
-            begin: begin.into(),
+            begin,
             size,
+            off: off.map(|off| if said(off) { off } else { 0.0 }).into(),
         }
+    }
+
+    /// How much further it lies than its voxels are put: less than one of them.
+    pub(crate) fn off(&self) -> DVec3 {
+        self.off
     }
 
     /// The level that it is of, in a volume of `finest` voxels; `None` if it has nothing of it. Where it covers the volume,
@@ -37,7 +49,10 @@ impl Placed {
         let mut extent = self.size;
         for axis in 0..3 {
             let (whole, by) = (f64::from(finest[axis]), downsampling[axis]);
-            let covers = (f64::from(self.size[axis]) * by - whole).abs() < by;
+            // As if it began where the volume does, and from where it begins: it may be longer for it.
+            let size = f64::from(self.size[axis]);
+            let ends = |at: f64| ((at + size) * by - whole).abs() < by;
+            let covers = ends(0.0) || ends(self.off[axis]);
             if self.begin[axis] != 0 || !covers {
                 #[expect(
                     clippy::cast_possible_truncation,
@@ -110,6 +125,28 @@ mod tests {
             let all = VoxelBox::of_size(level.extent);
             assert_eq!(placed.part(all), Some((all, UVec3::ZERO)));
             assert!(placed.note("1", level.extent).is_none());
+        }
+    }
+
+    /// Chunks that are halved begin on a grid that is not the volume's, and need one voxel more to reach its end.
+    #[test]
+    fn what_begins_before_the_volume_and_ends_behind_it_is_not_cut() {
+        let placed = |size, corner: f64| Placed::new(size, DVec3::new(0.0, corner, 0.0), 0.999);
+        let (finest, by) = (UVec3::new(20, 40, 9), DVec3::new(4.0, 4.0, 1.0));
+        let level = placed(UVec3::new(5, 11, 9), -0.75)
+            .level(finest, by)
+            .unwrap();
+        assert_eq!(level.extent, UVec3::new(5, 11, 9));
+        assert_eq!(
+            placed(UVec3::new(5, 11, 9), -0.75).off(),
+            DVec3::new(0.0, -0.75, 0.0)
+        );
+        // Without that, or longer still, it is another size.
+        for (size, corner) in [(11, 0.0), (11, 0.75), (12, -0.75), (8, -0.75)] {
+            let level = placed(UVec3::new(5, size, 9), corner)
+                .level(finest, by)
+                .unwrap();
+            assert_eq!(level.extent.y, 10, "{size} {corner}");
         }
     }
 

@@ -107,6 +107,11 @@ impl LevelArray {
         Ok(level)
     }
 
+    /// How much further it lies than its voxels are put \[voxels of the level\].
+    pub(super) fn off(&self) -> DVec3 {
+        self.placed.off()
+    }
+
     /// What a user should know of where it lies.
     pub(super) fn note(&self) -> Option<String> {
         self.note.clone()

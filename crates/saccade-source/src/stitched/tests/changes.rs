@@ -137,6 +137,42 @@ fn only_what_a_change_touches_is_built_again() {
     });
 }
 
+/// Where a tile's line begins to be drawn depends on its neighbours; what is drawn does not.
+#[test]
+fn a_neighbour_changes_nothing_outside_of_its_box() {
+    run(async {
+        let extent = UVec3::new(700, 300, 1);
+        let mut fixture = Fixture::new(extent, DVec3::new(4.0, 4.0, 30.0)).await;
+        for (n, x) in [(1_u32, -20.0), (2, 250.0)] {
+            let tile = tile((330, 290), 0, (x, 8.0), 2.0 + f64::from(n), 1.003, n.into());
+            fixture.put(&format!("t{n}"), tile).await;
+        }
+        let source = fixture.open().await;
+        let mut changes = source.changes();
+        let before = read_all(&source).await;
+        // As large as they are: beside smaller ones, coarse levels are drawn from finer levels of all.
+        let new = tile((330, 290), 0, (180.0, 160.0), -7.0, 1.0, 9);
+        let place = place(&fixture, &new);
+        fixture.put("new", new).await;
+        assert_eq!(changes.next().await.unwrap().voxels, place);
+        let after = read_all(&source).await;
+        for (level, (before, after)) in before.iter().zip(&after).enumerate() {
+            let level = fixture.volume.levels[level];
+            let touched = level.box_from_voxels(place);
+            let all = VoxelBox::of_size(level.extent).iter();
+            let (mut inside, mut outside) = (0, 0);
+            for ((at, before), after) in all.zip(before).zip(after) {
+                match touched.contains(at) {
+                    true => inside += u32::from(before != after),
+                    false => outside += u32::from(before != after),
+                }
+            }
+            assert!(inside > 0 || level.extent.x < 9, "the new tile is not seen");
+            assert_eq!(outside, 0, "voxels of a level of {}", level.extent);
+        }
+    });
+}
+
 #[derive(Clone, Debug)]
 enum Step {
     Put(usize, u32, (f64, f64), f64, u64),

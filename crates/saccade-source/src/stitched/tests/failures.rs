@@ -8,7 +8,7 @@ use futures::StreamExt;
 use glam::{DVec3, UVec3};
 use saccade_archive::catalog::NewTile;
 use saccade_archive::image::GrayImage;
-use saccade_archive::pyramid::{Encoding, encode};
+use saccade_archive::pyramid::{Encoding, encode, named};
 use saccade_core::volume::Dtype;
 
 use super::fixture::{Fixture, chunk_of, tile};
@@ -54,6 +54,10 @@ enum Harm {
     Cut,
     NoIndex,
     OtherSize,
+    /// A bit of its last sub-tile.
+    Flipped,
+    /// Whole, but made for another tile.
+    Mistaken,
 }
 
 #[test]
@@ -64,6 +68,8 @@ fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
         (Harm::Cut, false),
         (Harm::NoIndex, false),
         (Harm::OtherSize, false),
+        (Harm::Flipped, false),
+        (Harm::Mistaken, false),
     ] {
         run(async {
             let (mut fixture, left) = two().await;
@@ -82,6 +88,13 @@ fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
                     let image = GrayImage::new(64, 50, vec![9; 64 * 50]);
                     Some(encode(&image, &Encoding::Lossless).unwrap())
                 }
+                Harm::Flipped => {
+                    let mut bytes = whole.to_vec();
+                    let near_its_end = bytes.len() - 40;
+                    bytes[near_its_end] ^= 8;
+                    Some(Bytes::from(bytes))
+                }
+                Harm::Mistaken => Some(named(whole.clone(), "tiles/other-1.tif").unwrap()),
             };
             match harmed {
                 None => fixture.storage.delete(&left).await.unwrap(),
@@ -100,6 +113,16 @@ fn a_harmed_tile_fails_alone_and_is_healed_by_another_image() {
                 };
                 let size = matches!(source.downcast_ref(), Some(StitchError::Size { .. }));
                 assert_eq!(size, harm == Harm::OtherSize, "{told}");
+                assert_eq!(
+                    told.contains("checksum"),
+                    harm == Harm::Flipped || harm == Harm::Garbage,
+                    "{told}"
+                );
+                assert_eq!(
+                    told.contains("made for another tile"),
+                    harm == Harm::Mistaken,
+                    "{told}"
+                );
             }
             for x in [2, 3] {
                 match source.read(id(x)).await.unwrap() {

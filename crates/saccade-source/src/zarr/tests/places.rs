@@ -116,8 +116,35 @@ fn where_the_whole_lies_is_kept() {
     let source = open(folder.path()).unwrap();
     assert_eq!(source.volume().origin_nm, (at * by + further) * 1e3);
     assert_eq!(source.volume().voxel_nm, FINE * by * 1e3);
+    assert_eq!(source.volume().shifts_nm, Vec::new());
     let (_, still) = placed([json!([scale(FINE)]), json!([scale(COARSE)])]);
     assert_eq!(still.unwrap().volume().origin_nm, DVec3::ZERO);
+}
+
+/// A level may lie a part of a voxel from where its voxels are put: that is said as it was.
+#[test]
+fn what_a_level_is_off_is_kept() {
+    for by in [
+        DVec3::ZERO,
+        TOGETHER,
+        TOGETHER * 2.0,
+        TOGETHER + DVec3::new(1.0, -0.5, 2.0),
+        TOGETHER + DVec3::splat(0.4),
+    ] {
+        let (_folder, source) = placed([json!([scale(FINE)]), json!([scale(COARSE), moved(by)])]);
+        let source = source.unwrap();
+        let volume = source.volume();
+        let said = crate::ome::placed(volume)[1].first_nm;
+        // Voxels that are elsewhere are moved in whole ones.
+        let whole = ((by - TOGETHER) / COARSE).round() * COARSE;
+        let whole = DVec3::select(
+            ((by - TOGETHER) / COARSE).abs().cmpgt(DVec3::splat(0.501)),
+            whole,
+            DVec3::ZERO,
+        );
+        let off = (said - (by - whole) * 1e3).abs().max_element();
+        assert!(off < 1e-6, "{by}: {said}");
+    }
 }
 
 #[test]
