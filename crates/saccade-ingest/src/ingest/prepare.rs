@@ -16,15 +16,18 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::IngestError;
+use super::enter::SetAside;
 use super::images::Images;
 use crate::progress::Progress;
-use crate::watch::BEFORE_FIRST;
+use crate::watch::{BEFORE_FIRST, Stamp};
 
 /// What a file looks like from outside; another look means that someone writes to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Look {
     pub(super) bytes: u64,
     modified: Option<SystemTime>,
+    /// When the system last noted a change: who copies a file may say that it is old.
+    changed: Option<SystemTime>,
 }
 
 /// Looks at a file; `None` if there is none, or none that may be seen.
@@ -33,6 +36,7 @@ pub(super) fn look(path: &Path) -> Option<Look> {
     Some(Look {
         bytes: metadata.len(),
         modified: metadata.modified().ok(),
+        changed: Stamp::of(&metadata).ok().and_then(|stamp| stamp.changed),
     })
 }
 
@@ -145,6 +149,7 @@ pub(super) struct Context<'a> {
     pub(super) storage: &'a dyn Storage,
     pub(super) retry: Duration,
     pub(super) progress: &'a dyn Progress,
+    pub(super) set_aside: SetAside,
 }
 
 impl Context<'_> {
@@ -255,7 +260,13 @@ impl Context<'_> {
                 kind,
             })
         };
+        // Space that was set aside and is being filled looks whole.
+        let written_to = look(&path) != before;
         let pyramid = match pyramid {
+            Ok(Ok(_)) if written_to => {
+                let reason = "it was written to while it was read".to_owned();
+                return wait(reason, WaitKind::Incomplete);
+            }
             Ok(Ok(pyramid)) => pyramid,
             Ok(Err(Refusal::Incomplete(reason))) => return wait(reason, WaitKind::Incomplete),
             Ok(Err(Refusal::Broken(reason))) => return wait(reason, WaitKind::Broken),
@@ -370,6 +381,10 @@ fn build(
         ImageError::Size { width, height, .. } if watched => Refusal::Never(format!(
             "the image has {width} x {height} pixels, but had others when it was found; rename whole images into \
              the folder"
+        )),
+        ImageError::Unsupported { what } => Refusal::Never(format!(
+            "this kind of image cannot be read ({what}); convert it to a {}-bit grey TIFF or PNG",
+            8 * stored.dtype.bytes()
         )),
         _ => Refusal::Never(e.to_string()),
     })?;
