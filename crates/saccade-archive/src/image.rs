@@ -338,6 +338,36 @@ pub fn read_size(path: &Path) -> Result<[u32; 2], ImageError> {
     }
 }
 
+/// Bits of an image's samples, from its beginning; of a TIFF from its first directory.
+///
+/// # Errors
+///
+/// [`ImageError`].
+pub fn read_bits(path: &Path) -> Result<u32, ImageError> {
+    let failed = |source| ImageError::Read {
+        source,
+        path: path.to_owned(),
+    };
+    let mut file = File::open(path).map_err(failed)?;
+    let mut head = Vec::new();
+    let mut start = file.by_ref().take(sniff::HEAD);
+    start.read_to_end(&mut head).map_err(failed)?;
+    match sniff::kind(&head)? {
+        Kind::Tiff => {
+            file.rewind().map_err(failed)?;
+            tiff::bits(BufReader::new(file))
+        }
+        Kind::Png => {
+            /// Up to the byte after the size, in the first chunk.
+            const HEADER: u64 = 64;
+            file.take(HEADER).read_to_end(&mut head).map_err(failed)?;
+            png::bits(&head)
+        }
+        // Of others nothing is decoded.
+        Kind::Jpeg => Ok(8),
+    }
+}
+
 /// Reads and decodes a file to grey of 8 bits.
 ///
 /// # Errors

@@ -17,7 +17,7 @@ mod memory;
 mod name;
 mod object;
 
-pub use disk::{Crash, DirEntry, Disk, Metadata, OpenFile, SimulatedDisk, SystemDisk};
+pub use disk::{Crash, DirEntry, Disk, FolderId, Metadata, OpenFile, SimulatedDisk, SystemDisk};
 pub use error::StorageError;
 pub use faulty::{FaultyStorage, ReadFault, WriteFault};
 pub use local::LocalStorage;

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::catalog::{Catalog, CatalogError, CatalogLocation};
-use crate::storage::{Storage, StorageError};
+use crate::storage::{LocalStorage, MemoryStorage, Storage, StorageError};
 
 pub use identity::{IDENTITY, read_identity};
 pub use location::{ArchiveLocation, LocationError, StorageLocation};
@@ -44,8 +44,9 @@ pub enum ArchiveError {
     /// The catalog names pyramids of another archive.
     #[error(
         "the catalog {catalog} and the pyramids in {storage} are not of one archive; name the folder that \
-         the catalog was made with, or the catalog that was made with the folder. If all pyramids of the \
-         catalog were lost, ingest the acquisition again into a new archive"
+         the catalog was made with, or the catalog that was made with the folder.{} If all pyramids of the \
+         catalog were lost, ingest the acquisition again into a new archive",
+        mount_hint(storage)
     )]
     Strangers {
         /// Where the pyramids lie.
@@ -84,6 +85,16 @@ pub enum ArchiveError {
     /// The storage could not be opened.
     #[error(transparent)]
     Storage(#[from] StorageError),
+}
+
+/// What a folder may lack that has not what it should have.
+fn mount_hint(storage: &StorageLocation) -> &'static str {
+    match storage {
+        StorageLocation::Folder(_) => {
+            " Is the disk mounted on which the pyramids lie? Until it is, its mount point is an empty folder."
+        }
+        StorageLocation::Bucket(_) => "",
+    }
 }
 
 impl VisualizationArchive {
@@ -139,8 +150,15 @@ impl VisualizationArchive {
         };
         let (catalog, storage) = match location.storage() {
             // After the catalog: where there is none, no folder is made.
-            StorageLocation::Folder(_) => {
+            StorageLocation::Folder(folder) => {
                 let catalog = catalog().await?;
+                // Opening a folder makes it, which is not to be done where its disk is not mounted.
+                let there: Arc<dyn Storage> = if folder.is_dir() {
+                    Arc::new(LocalStorage::as_it_is(folder)?)
+                } else {
+                    Arc::new(MemoryStorage::new())
+                };
+                identity::refuse_strangers(&catalog, &*there, location).await?;
                 let storage = location.storage().open().await?;
                 (catalog, storage)
             }

@@ -14,7 +14,7 @@ pub struct State {
     pub queued: u64,
     /// Tiles whose file is not whole yet.
     pub waiting: u64,
-    /// Files and records put in quarantine since the work began.
+    /// Files and records put in quarantine since the work began, without those that were mended since.
     pub quarantined: u64,
     /// Pixels per second, over the last seconds \[Mpixel/s\].
     pub mpixel_per_s: f64,

@@ -261,7 +261,8 @@ fn described(
     let name = config.name.as_ref().unwrap_or(&acquisition.name);
     check_name(name)?;
     crate::simulate::check_rate_and_voxel(config.rate_mpixel_s, config.voxel_nm)?;
-    let info = AcquisitionInfo::new(name, acquisition.extent, config.voxel_nm);
+    let mut info = AcquisitionInfo::new(name, acquisition.extent, config.voxel_nm);
+    info.dtype = acquisition.dtype;
     Ok((info, Settings::of_replay(&acquisition.identity())))
 }
 

@@ -10,10 +10,12 @@
 //!
 //! Folders of sections are cursors: one look asks at most [`WatchConfig::budget`] folders and files what
 //! they are, lists only folders that changed since they were last listed, and goes on where the last look
-//! stopped. Sixteen bytes are kept per file, and eight more for those that an earlier process told of, until
-//! they are met. A file counts as new when its folder changed and its length or
-//! time did, so a microscope that images a tile again writes it under a temporary name and renames it, or
-//! under another name. Files that go away are not deletions: disks are cleared.
+//! stopped. Sixteen bytes are kept per file, and as many more for those that an earlier process told of, until
+//! they are met; and in a file, `stamps`, as many for each time that one was told of. A file counts as new when its
+//! folder changed and its length or time did, or it is another file, so a microscope that images a tile again
+//! writes it under a temporary name and renames it, or under another name. For half a minute after it was found or
+//! changed, a file itself is looked at, each second, with half of the budget at most: one that was filled meanwhile
+//! is told of again. Files that go away are not deletions: disks are cleared.
 
 use std::collections::{HashSet, VecDeque};
 use std::fs;
@@ -31,15 +33,21 @@ use saccade_core::transform::SectionFromTile;
 use crate::Cancel;
 use crate::simulate::settings::{Settings, difference, volume_differences};
 use list::List;
+use stamp::Seen;
+use stamps::Stamps;
 
+mod again;
 mod list;
 mod pattern;
 mod scan;
+mod stamp;
+mod stamps;
 #[cfg(test)]
 mod tests;
 
 pub use pattern::{Pattern, PatternError, Place};
-pub use scan::{Counts, Disk, Entry, Folders, Found, Next, Scanner, Stamp};
+pub use scan::{Counts, Disk, Entry, Folders, Found, Next, Scanner};
+pub use stamp::Stamp;
 
 /// How a folder is watched.
 #[derive(Clone, Debug, PartialEq)]
@@ -127,7 +135,9 @@ pub struct Watch<F> {
     /// The list of records, while this process is the one that writes it.
     list: Option<List>,
     /// Records that could not be written yet.
-    untold: VecDeque<Record>,
+    untold: VecDeque<Untold>,
+    /// What files looked like when they were told of.
+    stamps: Stamps,
     /// Files whose size could not be read yet.
     unread: VecDeque<Unread>,
     /// Whether the folder was gone through once.
@@ -140,6 +150,9 @@ fn is_unused(kept: &Path) -> Result<bool, WatchError> {
     let none = records.map_or(true, |meta| meta.len() == 0);
     Ok(none && List::open(kept)?.is_some())
 }
+
+/// A record that is to be written, and what to remember its file by.
+type Untold = (Record, Option<(u64, Seen)>);
 
 /// A file that is not written as far as its size.
 struct Unread {
@@ -225,6 +238,11 @@ impl<F: Folders> Watch<F> {
         if settings.as_ref() != Some(&now) {
             now.write_to(kept.join(SETTINGS))?;
         }
+        let stamps = Stamps::new(kept);
+        if linked.is_some_and(|linked| linked != folder) {
+            // Copies are other files.
+            stamps.forget();
+        }
         let scanner = Scanner::new(folders, &folder, config.pattern.clone());
         let mut watch = Self {
             config,
@@ -233,6 +251,7 @@ impl<F: Folders> Watch<F> {
             kept: kept.to_owned(),
             list: None,
             untold: VecDeque::new(),
+            stamps,
             unread: VecDeque::new(),
             seen: false,
         };
@@ -271,6 +290,8 @@ impl<F: Folders> Watch<F> {
                     }
                 }
             }
+            let scanner = &mut self.scanner;
+            self.stamps.each(|key, seen| scanner.remember_as(key, seen));
         }
         self.list = Some(list);
         Ok(true)
@@ -303,12 +324,20 @@ impl<F: Folders> Watch<F> {
     fn tell(&mut self) -> Result<u64, WatchError> {
         let mut told = 0;
         if let Some(list) = &mut self.list {
-            while let Some(record) = self.untold.front() {
-                list.append(record)?;
+            let mut stamps = Vec::new();
+            let written = loop {
+                let Some((record, stamp)) = self.untold.front() else {
+                    break list.sync();
+                };
+                if let Err(e) = list.append(record) {
+                    break Err(e);
+                }
+                stamps.extend(*stamp);
                 self.untold.pop_front();
                 told += 1;
-            }
-            list.sync()?;
+            };
+            self.stamps.add(&stamps);
+            written?;
         }
         Ok(told)
     }
@@ -350,10 +379,14 @@ impl<F: Folders> Watch<F> {
         all.sort_by(|a, b| a.found.file.cmp(&b.found.file));
         let patience = self.config.poll * PATIENCE;
         for mut unread in all {
+            // Before anything is read: what changes later is seen to have changed.
+            let stamp = match unread.since {
+                since if since == now => unread.stamp,
+                _ => self.scanner.stamp(&unread.found.file),
+            };
             let size = match read_size(&self.folder.join(&unread.found.file)) {
                 Ok([x, y]) => UVec2::new(x, y),
                 Err(_) => {
-                    let stamp = self.scanner.stamp(&unread.found.file);
                     if stamp != unread.stamp {
                         (unread.stamp, unread.since) = (stamp, now);
                     }
@@ -366,7 +399,8 @@ impl<F: Folders> Watch<F> {
                 }
             };
             let record = Record::Tile(self.record(&unread.found, size));
-            self.untold.push_back(record);
+            let stamp = stamp.map(|stamp| self.scanner.tells(&unread.found.file, stamp));
+            self.untold.push_back((record, stamp));
         }
         let told = before + self.tell()?;
         if next == Next::Rest && !self.unread.is_empty() {
@@ -432,11 +466,13 @@ pub fn run<F: Folders>(
                 }
             }
             Err(WatchError::Look { source, path }) if failures < 10 => {
+                if failures == 0 {
+                    log::warn!(
+                        "cannot look into {}, trying again: {source}",
+                        path.display()
+                    );
+                }
                 failures += 1;
-                log::warn!(
-                    "cannot look into {}, trying again: {source}",
-                    path.display()
-                );
             }
             Err(e) if e.is_full() => {
                 if full.is_multiple_of(SAY_AGAIN) {

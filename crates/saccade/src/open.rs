@@ -24,36 +24,58 @@ use crate::arguments::CatalogArgument;
 use crate::report::say;
 use crate::stitching::Stitching;
 
-/// Between attempts to open an archive whose catalog's server is away.
+/// Between attempts to open an archive whose catalog's server, or object store, is away.
 const TRY_AGAIN: Duration = Duration::from_secs(1);
 
 /// Opens an archive for work that goes on for months. While the server of its catalog is away, or has no catalog
-/// yet, waits for it, and says so.
+/// yet, or its object store is away, waits for it, and says so.
 pub(crate) async fn waited_for<F>(mut open: impl FnMut() -> F) -> Result<VisualizationArchive>
 where
     F: Future<Output = Result<VisualizationArchive, ArchiveError>>,
 {
-    let mut waits_for = None;
+    let mut waits_for: Option<Missing> = None;
     loop {
-        match open().await {
-            Err(ArchiveError::Catalog(error)) if passes(&error) => {
-                // Once for each reason.
-                let what = error.to_string();
-                if waits_for.as_ref() != Some(&what) {
-                    let reason = error.source().map_or(String::new(), |e| format!(" ({e})"));
-                    say(&format!(
-                        "{what}{reason}; trying again until it can be used"
-                    ));
-                }
-                waits_for = Some(what);
-                tokio::time::sleep(TRY_AGAIN).await;
+        let missing = match open().await {
+            Err(ArchiveError::Catalog(error)) if passes(&error) => Missing::new("catalog", &error),
+            Err(ArchiveError::Storage(error)) if error.is_outage() => {
+                Missing::new("storage", &error)
             }
             opened => {
-                if waits_for.is_some() && opened.is_ok() {
-                    say("the catalog can be used now");
+                if let Some(Missing { part, .. }) = waits_for
+                    && opened.is_ok()
+                {
+                    say(&format!("the {part} can be used now"));
                 }
                 return Ok(opened?);
             }
+        };
+        // Once for each reason.
+        if waits_for.as_ref().map(|waits| &waits.what) != Some(&missing.what) {
+            let Missing { what, reason, .. } = &missing;
+            say(&format!(
+                "{what}{reason}; trying again until it can be used"
+            ));
+        }
+        waits_for = Some(missing);
+        tokio::time::sleep(TRY_AGAIN).await;
+    }
+}
+
+/// What an archive cannot be opened without.
+struct Missing {
+    part: &'static str,
+    what: String,
+    /// In brackets.
+    reason: String,
+}
+
+impl Missing {
+    fn new(part: &'static str, error: &dyn Error) -> Self {
+        let reason = error.source().map_or(String::new(), |e| format!(" ({e})"));
+        Self {
+            part,
+            what: error.to_string(),
+            reason,
         }
     }
 }

@@ -34,9 +34,12 @@ struct SoFar {
     /// Why it does not go on.
     held_up: Option<String>,
     lines: Lines,
+    /// Why it did not go on when the last line was written.
+    told: Option<String>,
 }
 
-/// When to write a line: at once, then every [`LINES`] while there is something to do, or news.
+/// When to write a line: at once, then every [`LINES`] while there is something to do, or news. What holds all up
+/// is told once, until it is something else.
 #[derive(Default)]
 struct Lines {
     last: Option<(Instant, State)>,
@@ -76,6 +79,7 @@ impl Shown {
             state: None,
             held_up: None,
             lines: Lines::default(),
+            told: None,
         });
         let inner = Arc::new(Inner { label, bar, so_far });
         if inner.bar.is_none() {
@@ -126,9 +130,12 @@ impl Inner {
         let (Some(state), None) = (so_far.state, &self.bar) else {
             return;
         };
-        let busy = so_far.held_up.is_some()
-            || state.tiles + state.quarantined < known(&state, so_far.total);
+        let busy = match so_far.held_up {
+            Some(_) => so_far.held_up != so_far.told,
+            None => state.tiles + state.quarantined < known(&state, so_far.total),
+        };
         if so_far.lines.due(now(), &state, busy) {
+            so_far.told = so_far.held_up.clone();
             self.line(&state, &so_far);
         }
     }

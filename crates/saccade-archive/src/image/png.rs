@@ -78,6 +78,13 @@ pub(super) fn size(head: &[u8]) -> Result<[u32; 2], ImageError> {
     }
 }
 
+/// Bits of a sample: after the size.
+pub(super) fn bits(head: &[u8]) -> Result<u32, ImageError> {
+    size(head)?;
+    let bits = head.get(24).copied().map(u32::from);
+    bits.ok_or_else(|| incomplete("it ends within its header"))
+}
+
 fn sort(e: DecodingError) -> ImageError {
     match e {
         DecodingError::IoError(e) if e.kind() == io::ErrorKind::UnexpectedEof => {

@@ -109,6 +109,13 @@ pub(super) fn size(file: impl Read + Seek) -> Result<[u32; 2], ImageError> {
     Ok([width, height])
 }
 
+/// Bits of a sample.
+pub(super) fn bits(file: impl Read + Seek) -> Result<u32, ImageError> {
+    let mut decoder = Decoder::new(file).map_err(sort)?;
+    let color = decoder.colortype().map_err(sort)?;
+    Ok(color.bit_depth().into())
+}
+
 /// Samples of 1, 2 or 4 bits, the first in the highest bits, times `scale`.
 pub(super) fn unpack(
     packed: &[u8],

@@ -10,8 +10,10 @@ use std::time::SystemTime;
 
 use bytes::Bytes;
 
+mod folder_id;
 mod simulated;
 
+pub use folder_id::FolderId;
 pub use simulated::{Crash, SimulatedDisk};
 
 /// A file system, in steps that a power cut can come between. All block.
@@ -68,6 +70,16 @@ pub trait Disk: Send + Sync + fmt::Debug {
     ///
     /// [`io::ErrorKind::NotFound`] if nothing is; what the system says.
     fn metadata(&self, path: &Path) -> io::Result<Metadata>;
+
+    /// Which folder is at a path, by which it is told from another that takes its place; `None` where folders
+    /// cannot be told apart.
+    ///
+    /// # Errors
+    ///
+    /// [`io::ErrorKind::NotFound`] if nothing is; what the system says.
+    fn folder_id(&self, path: &Path) -> io::Result<Option<FolderId>> {
+        self.metadata(path).map(|_| None)
+    }
 
     /// What a folder holds, in any order.
     ///
@@ -181,6 +193,10 @@ impl Disk for SystemDisk {
             len: metadata.len(),
             modified: metadata.modified().ok(),
         })
+    }
+
+    fn folder_id(&self, path: &Path) -> io::Result<Option<FolderId>> {
+        Ok(FolderId::of(&fs::metadata(path)?))
     }
 
     fn read_dir(&self, path: &Path) -> io::Result<Vec<DirEntry>> {

@@ -48,6 +48,16 @@ pub enum StorageError {
         /// File or folder that was to be kept.
         path: String,
     },
+    /// The folder that was opened is no longer there, or another is in its place, as where a disk was
+    /// unmounted. Nothing is written to that one.
+    #[error(
+        "the archive's folder is not there any more, or another lies in its place, to which nothing is written; is \
+         its disk mounted? Mount it again, or put the folder back, and work goes on: {path}"
+    )]
+    Away {
+        /// The folder.
+        path: String,
+    },
     /// An object store refuses, and will until someone changes something.
     #[error("{advice}: {path}")]
     Refused {
@@ -114,6 +124,7 @@ impl StorageError {
             | Self::Refused { path, .. }
             | Self::Unavailable { path, .. }
             | Self::Occupied { path }
+            | Self::Away { path }
             | Self::Io { path, .. } => text.replace(&format!(": {path}"), ""),
             Self::NotFound { .. } | Self::Name { .. } => text,
         }
@@ -124,8 +135,11 @@ impl StorageError {
         self.is_outage() || matches!(self, Self::Io { .. })
     }
 
-    /// Whether nothing but waiting helps, however long: the disk is full, the object store is away.
+    /// Whether nothing but waiting helps, however long: the disk is full or not mounted, the object store is away.
     pub fn is_outage(&self) -> bool {
-        matches!(self, Self::Full { .. } | Self::Unavailable { .. })
+        matches!(
+            self,
+            Self::Full { .. } | Self::Away { .. } | Self::Unavailable { .. }
+        )
     }
 }

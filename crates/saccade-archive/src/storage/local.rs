@@ -12,6 +12,10 @@ use futures::future::BoxFuture;
 use super::disk::{Disk, SystemDisk};
 use super::{Entry, Storage, StorageError, check_name};
 
+mod root;
+
+use root::Root;
+
 /// Where unfinished writes live, below the root. No object's name begins with a dot.
 const INCOMING: &str = ".incoming";
 
@@ -29,6 +33,10 @@ static NEXT: AtomicU64 = AtomicU64::new(0);
 /// A sync that fails may have lost what was written, and the next one says nothing of it. After such a
 /// failure, unless the disk was merely full, nothing more is written here
 /// ([`StorageError::NotKept`]): reading goes on.
+///
+/// The folder is known again, see [`Disk::folder_id`]. Where another takes its place, because its disk was
+/// unmounted, nothing is written there, and nothing is said to be missing: that is [`StorageError::Away`], until it
+/// is back. It is made when it is opened, and never again.
 #[derive(Clone, Debug)]
 pub struct LocalStorage(Arc<Inner>);
 
@@ -36,6 +44,8 @@ pub struct LocalStorage(Arc<Inner>);
 struct Inner {
     disk: Arc<dyn Disk>,
     root: PathBuf,
+    /// By what the root is known again, once it is open.
+    known: Root,
     /// Folders whose names are durable, as this process has seen to. Others may have been made by
     /// a process that died before it synced them.
     kept: Mutex<BTreeSet<PathBuf>>,
@@ -47,6 +57,8 @@ struct Inner {
 enum WriteError {
     Io(io::Error),
     Sync(io::Error),
+    /// The root is not there, or another folder is in its place.
+    Away,
 }
 
 impl From<io::Error> for WriteError {
@@ -74,12 +86,7 @@ impl LocalStorage {
     ///
     /// As [`new`](Self::new).
     pub fn on(disk: Arc<dyn Disk>, root: impl Into<PathBuf>) -> Result<Self, StorageError> {
-        let storage = Self(Arc::new(Inner {
-            disk,
-            root: root.into(),
-            kept: Mutex::default(),
-            stopped: AtomicBool::new(false),
-        }));
+        let storage = Self::unopened(disk, root.into());
         let inner = &*storage.0;
         let incoming = inner.root.join(INCOMING);
         let sort = |e| StorageError::new(e, INCOMING, incoming.display().to_string());
@@ -88,10 +95,12 @@ impl LocalStorage {
             .map_err(|e| inner.sorted(e, INCOMING, &incoming))
         {
             Err(StorageError::Denied { .. }) if inner.disk.read_dir(&inner.root).is_ok() => {
+                inner.remember_root()?;
                 return Ok(storage);
             }
             prepared => prepared?,
         }
+        inner.remember_root()?;
         for entry in inner.disk.read_dir(&incoming).map_err(sort)? {
             let path = incoming.join(entry.name);
             match inner.disk.remove_if_unlocked(&path) {
@@ -103,6 +112,27 @@ impl LocalStorage {
             }
         }
         Ok(storage)
+    }
+
+    /// Opens a folder that is there, to look at it: nothing in it changes, and nothing is made.
+    ///
+    /// # Errors
+    ///
+    /// [`StorageError`] if it is not there, or cannot be asked.
+    pub(crate) fn as_it_is(root: impl Into<PathBuf>) -> Result<Self, StorageError> {
+        let storage = Self::unopened(Arc::new(SystemDisk), root.into());
+        storage.0.remember_root()?;
+        Ok(storage)
+    }
+
+    fn unopened(disk: Arc<dyn Disk>, root: PathBuf) -> Self {
+        Self(Arc::new(Inner {
+            disk,
+            root,
+            known: Root::default(),
+            kept: Mutex::default(),
+            stopped: AtomicBool::new(false),
+        }))
     }
 
     /// The folder.
@@ -142,10 +172,13 @@ impl LocalStorage {
         async move {
             let task = tokio::task::spawn_blocking(move || {
                 let mut found: Vec<Entry> = Vec::new();
+                let walked = inner.walk(&inner.root, "", &prefix, most, &mut found);
+                // Of what lies in the folder's place, nothing follows.
+                if !inner.is_there() {
+                    return Err(inner.away());
+                }
                 let failed = |e| StorageError::new(e, &prefix, inner.root.display().to_string());
-                inner
-                    .walk(&inner.root, "", &prefix, most, &mut found)
-                    .map_err(failed)?;
+                walked.map_err(failed)?;
                 found.sort_unstable_by(|a, b| a.name.cmp(&b.name));
                 Ok(found)
             });
@@ -159,9 +192,40 @@ impl LocalStorage {
 }
 
 impl Inner {
+    fn away(&self) -> StorageError {
+        StorageError::Away {
+            path: self.root.display().to_string(),
+        }
+    }
+
+    /// Notes by what the root is known again.
+    fn remember_root(&self) -> Result<(), StorageError> {
+        let failed = |e| StorageError::new(e, "", self.root.display().to_string());
+        self.known.remember(&*self.disk, &self.root).map_err(failed)
+    }
+
+    /// Whether the root is still the folder that was opened.
+    fn is_there(&self) -> bool {
+        self.known.is_there(&*self.disk, &self.root)
+    }
+
+    fn check_root(&self) -> Result<(), WriteError> {
+        if self.is_there() {
+            Ok(())
+        } else {
+            Err(WriteError::Away)
+        }
+    }
+
     fn sorted(&self, error: WriteError, name: &str, path: &Path) -> StorageError {
         let path = path.display().to_string();
         match error {
+            WriteError::Away => self.away(),
+            WriteError::Io(_) if !self.is_there() => self.away(),
+            // Its folder went away before it could be synced, as any folder's parts do with it.
+            WriteError::Sync(e) if e.kind() == io::ErrorKind::NotFound && !self.is_there() => {
+                self.away()
+            }
             WriteError::Io(e) => StorageError::new(e, name, path),
             WriteError::Sync(e) => match StorageError::new(e, name, path) {
                 // Everything is written anew once there is space.
@@ -183,9 +247,14 @@ impl Inner {
         let parent = path.parent().unwrap_or(&self.root);
         let incoming = self.root.join(INCOMING);
         for _ in 1..WRITE_ATTEMPTS {
+            self.check_root()?;
             let prepared = self.prepare(&incoming).and_then(|()| self.prepare(parent));
             match prepared.and_then(|()| self.write_once(path, bytes)) {
-                Ok(()) => return self.disk.sync_dir(parent).map_err(WriteError::Sync),
+                Ok(()) => {
+                    self.disk.sync_dir(parent).map_err(WriteError::Sync)?;
+                    // What was written to another folder meanwhile is not acknowledged.
+                    return self.check_root();
+                }
                 // Another process cleaned up between this one's creating and locking the file, or
                 // someone emptied the whole folder.
                 Err(WriteError::Io(e)) if e.kind() == io::ErrorKind::NotFound => {
@@ -229,6 +298,9 @@ impl Inner {
         let above_root = !path.starts_with(&self.root) || path == self.root;
         if exists && above_root {
             return Ok(());
+        }
+        if above_root && self.known.is_known() {
+            return Err(WriteError::Away);
         }
         let parent = path
             .parent()
@@ -330,7 +402,7 @@ impl Storage for LocalStorage {
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
         self.blocking(name, |inner, path| match inner.disk.remove_file(path) {
-            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => inner.check_root(),
             Err(e) => Err(e.into()),
             Ok(()) => {
                 let parent = path.parent().unwrap_or(&inner.root);
@@ -345,241 +417,4 @@ impl Storage for LocalStorage {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::fs::{self, File};
-
-    use super::super::SimulatedDisk;
-    use super::*;
-
-    #[tokio::test]
-    async fn conforms() {
-        let dir = tempfile::tempdir().unwrap();
-        let storage = LocalStorage::new(dir.path().join("deep/root")).unwrap();
-        super::super::conformance::check(Arc::new(storage)).await;
-    }
-
-    #[tokio::test]
-    async fn a_folder_in_the_place_of_a_file_is_said_to_be_one() {
-        let dir = tempfile::tempdir().unwrap();
-        let storage = LocalStorage::new(dir.path()).unwrap();
-        fs::create_dir_all(dir.path().join("tiles/a.tif/inside")).unwrap();
-        let write = storage.write_durable("tiles/a.tif", Bytes::from_static(b"x"));
-        let refused = write.await.unwrap_err();
-        assert!(
-            matches!(refused, StorageError::Occupied { .. }),
-            "{refused}"
-        );
-        assert!(!refused.is_transient());
-        assert!(refused.to_string().contains("tiles/a.tif"), "{refused}");
-        assert_eq!(fs::read_dir(dir.path().join(INCOMING)).unwrap().count(), 0);
-    }
-
-    #[tokio::test]
-    async fn conforms_on_a_simulated_disk() {
-        let storage = LocalStorage::on(Arc::new(SimulatedDisk::new()), "deep/root").unwrap();
-        super::super::conformance::check(Arc::new(storage)).await;
-    }
-
-    /// Whichever sync fails: nothing that was acknowledged is lost, and the storage says why it stops.
-    #[tokio::test]
-    async fn after_a_failed_sync_nothing_more_is_written() {
-        let mut stopped = 0;
-        for nth in 0..20 {
-            let disk = SimulatedDisk::new();
-            let storage = LocalStorage::on(Arc::new(disk.clone()), "root").unwrap();
-            disk.fail_sync_at(nth);
-            let mut acknowledged = Vec::new();
-            let mut failed = None;
-            for name in ["tiles/a", "tiles/b", "tiles/c/d", "tiles/a"] {
-                match storage
-                    .write_durable(name, Bytes::from_static(b"abc"))
-                    .await
-                {
-                    Ok(()) => acknowledged.push(name),
-                    Err(e) => failed = failed.or(Some(e)),
-                }
-            }
-            let Some(error) = failed else {
-                assert_eq!(acknowledged.len(), 4);
-                continue;
-            };
-            stopped += 1;
-            assert!(matches!(error, StorageError::NotKept { .. }), "{error:?}");
-            assert!(!error.is_transient());
-            let again = storage.write_durable("e", Bytes::new()).await;
-            assert!(
-                matches!(again, Err(StorageError::NotKept { .. })),
-                "{again:?}"
-            );
-            for seed in 0..20 {
-                let left = disk.after_crash(&mut super::super::Crash::new(seed));
-                let left = LocalStorage::on(Arc::new(left), "root").unwrap();
-                for name in &acknowledged {
-                    let read = left.read(name, None).await.unwrap();
-                    assert_eq!(read, b"abc"[..], "{name}, sync {nth}, seed {seed}");
-                }
-            }
-        }
-        assert!(stopped > 5, "only {stopped} syncs failed");
-    }
-
-    /// Its maker died before it was entered durably in the folder above.
-    #[tokio::test]
-    async fn folders_that_others_made_are_made_durable() {
-        let disk = SimulatedDisk::new();
-        let storage = LocalStorage::on(Arc::new(disk.clone()), "root").unwrap();
-        disk.create_dir(Path::new("root/tiles")).unwrap();
-        disk.create_dir(Path::new("root/tiles/v")).unwrap();
-        storage
-            .write_durable("tiles/v/a", Bytes::from_static(b"abc"))
-            .await
-            .unwrap();
-        for seed in 0..50 {
-            let left = disk.after_crash(&mut super::super::Crash::new(seed));
-            let read = left.read(Path::new("root/tiles/v/a"), None).unwrap();
-            assert_eq!(read, b"abc"[..]);
-        }
-    }
-
-    #[tokio::test]
-    async fn abandoned_temporaries_go_and_living_ones_stay() {
-        let dir = tempfile::tempdir().unwrap();
-        let incoming = dir.path().join(INCOMING);
-        fs::create_dir_all(&incoming).unwrap();
-        fs::write(incoming.join("1-0"), b"half a til").unwrap();
-        let living = File::create(incoming.join("2-0")).unwrap();
-        living.lock().unwrap();
-        let storage = LocalStorage::new(dir.path()).unwrap();
-        assert!(!incoming.join("1-0").exists());
-        assert!(incoming.join("2-0").exists());
-        assert!(storage.list("").await.unwrap().is_empty());
-    }
-
-    #[tokio::test]
-    async fn a_failed_write_leaves_nothing_behind() {
-        let dir = tempfile::tempdir().unwrap();
-        let storage = LocalStorage::new(dir.path()).unwrap();
-        // A folder stands where the object should go: the rename fails, after the data is written.
-        fs::create_dir_all(dir.path().join("tiles/a.tif/x")).unwrap();
-        assert!(
-            storage
-                .write_durable("tiles/a.tif", Bytes::from_static(b"abc"))
-                .await
-                .is_err()
-        );
-        assert_eq!(fs::read_dir(dir.path().join(INCOMING)).unwrap().count(), 0);
-    }
-
-    #[tokio::test]
-    async fn temporaries_of_others_are_neither_touched_nor_in_the_way() {
-        let dir = tempfile::tempdir().unwrap();
-        let storage = LocalStorage::new(dir.path()).unwrap();
-        let incoming = dir.path().join(INCOMING);
-        // The same process number on another machine: the next names are all taken.
-        let write = || storage.write_durable("a", Bytes::from_static(b"ours"));
-        write().await.unwrap();
-        let next = NEXT.load(Ordering::Relaxed);
-        for number in next..next + 60 {
-            fs::write(
-                incoming.join(format!("{}-{number}", std::process::id())),
-                b"theirs",
-            )
-            .unwrap();
-        }
-        write().await.unwrap();
-        assert_eq!(storage.read("a", None).await.unwrap(), b"ours"[..]);
-        for entry in fs::read_dir(&incoming).unwrap() {
-            assert_eq!(fs::read(entry.unwrap().path()).unwrap(), b"theirs");
-        }
-    }
-
-    #[tokio::test]
-    async fn a_folder_emptied_by_someone_is_made_anew() {
-        let dir = tempfile::tempdir().unwrap();
-        let root = dir.path().join("root");
-        let storage = LocalStorage::new(&root).unwrap();
-        fs::remove_dir_all(&root).unwrap();
-        storage
-            .write_durable("tiles/a", Bytes::from_static(b"abc"))
-            .await
-            .unwrap();
-        assert_eq!(storage.list("").await.unwrap(), ["tiles/a"]);
-    }
-
-    #[tokio::test]
-    async fn a_folder_that_is_a_file_cannot_be_opened() {
-        let dir = tempfile::tempdir().unwrap();
-        fs::write(dir.path().join("file"), b"").unwrap();
-        let error = LocalStorage::new(dir.path().join("file")).unwrap_err();
-        assert!(error.to_string().contains("file/.incoming"), "{error}");
-    }
-
-    #[tokio::test]
-    async fn what_is_forbidden_is_denied() {
-        use std::os::unix::fs::PermissionsExt as _;
-        let dir = tempfile::tempdir().unwrap();
-        let storage = LocalStorage::new(dir.path()).unwrap();
-        storage
-            .write_durable("closed/a", Bytes::from_static(b"abc"))
-            .await
-            .unwrap();
-        let closed = dir.path().join("closed");
-        fs::set_permissions(&closed, fs::Permissions::from_mode(0o000)).unwrap();
-        let read = storage.read("closed/a", None).await;
-        let allowed = fs::read_dir(&closed).is_ok();
-        fs::set_permissions(&closed, fs::Permissions::from_mode(0o755)).unwrap();
-        // The superuser may read everything.
-        assert!(
-            allowed || matches!(read, Err(StorageError::Denied { .. })),
-            "{read:?}"
-        );
-    }
-
-    #[test]
-    fn what_the_system_says_is_sorted() {
-        let sorted = |kind: io::ErrorKind| StorageError::new(kind.into(), "n", "p".to_owned());
-        assert!(matches!(
-            sorted(io::ErrorKind::NotFound),
-            StorageError::NotFound { .. }
-        ));
-        assert!(matches!(
-            sorted(io::ErrorKind::StorageFull),
-            StorageError::Full { .. }
-        ));
-        assert!(matches!(
-            sorted(io::ErrorKind::QuotaExceeded),
-            StorageError::Full { .. }
-        ));
-        assert!(matches!(
-            sorted(io::ErrorKind::PermissionDenied),
-            StorageError::Denied { .. }
-        ));
-        assert!(matches!(
-            sorted(io::ErrorKind::ReadOnlyFilesystem),
-            StorageError::Denied { .. }
-        ));
-        assert!(matches!(
-            sorted(io::ErrorKind::TimedOut),
-            StorageError::Io { .. }
-        ));
-        // Error number 28 is what a full disk answers.
-        let full = StorageError::new(io::Error::from_raw_os_error(28), "n", "p".to_owned());
-        assert!(matches!(full, StorageError::Full { .. }) && full.is_transient());
-    }
-
-    #[tokio::test]
-    async fn names_do_not_leave_the_folder() {
-        let dir = tempfile::tempdir().unwrap();
-        let storage = LocalStorage::new(dir.path()).unwrap();
-        for name in ["../outside", "/etc/hostname", "a/../../outside"] {
-            let read = storage.read(name, None).await;
-            assert!(
-                matches!(read, Err(StorageError::Name { .. })),
-                "{name}: {read:?}"
-            );
-            let write = storage.write_durable(name, Bytes::new()).await;
-            assert!(matches!(write, Err(StorageError::Name { .. })), "{name}");
-        }
-        assert!(!dir.path().parent().unwrap().join("outside").exists());
-    }
-}
+mod tests;

@@ -118,6 +118,15 @@ async fn meet(
     Err(strangers(location))
 }
 
+/// Refuses parts of different archives, and changes nothing.
+pub(super) async fn refuse_strangers(
+    catalog: &Catalog,
+    storage: &dyn Storage,
+    location: &ArchiveLocation,
+) -> Result<(), ArchiveError> {
+    meet(catalog, storage, location).await.map(|_| ())
+}
+
 /// Refuses parts of different archives.
 pub(super) async fn check(
     catalog: &Catalog,
@@ -286,6 +295,27 @@ mod tests {
             }
             // Who wrote has given both an identity.
             assert!(is_refused(VisualizationArchive::open(&mixed).await));
+        }
+    }
+
+    /// As where the disk is not mounted on which the pyramids lie.
+    #[tokio::test]
+    async fn a_folder_that_is_not_there_is_not_made_for_a_catalog_that_knows_pyramids() {
+        let folder = tempfile::tempdir().unwrap();
+        let (one, mount) = (folder.path().join("one"), folder.path().join("mount"));
+        made(&one, false).await;
+        std::fs::create_dir(&mount).unwrap();
+        for place in [mount.clone(), mount.join("archive")] {
+            let location = crossed(&one, &place);
+            for opened in [
+                VisualizationArchive::open(&location).await,
+                VisualizationArchive::create(&location).await,
+            ] {
+                let told = opened.map(drop).unwrap_err().to_string();
+                assert!(told.contains("Is the disk mounted"), "{told}");
+                let left: Vec<_> = std::fs::read_dir(&mount).unwrap().collect();
+                assert!(left.is_empty(), "{left:?}");
+            }
         }
     }
 

@@ -1,7 +1,9 @@
 //! The second half of the pipeline: what became of records is entered in the catalog.
 
+use std::collections::BTreeMap;
 use std::future::Future;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
 use saccade_archive::VisualizationArchive;
@@ -38,6 +40,35 @@ pub(super) struct Enter<'a> {
     pub(super) left: &'a AtomicU64,
 }
 
+/// What became of what is set aside.
+pub(super) enum Change {
+    /// A file or record was set aside: that of a tile, if it is known of which.
+    SetAside(Option<String>),
+    /// All that was set aside of a tile is of no account any more: it is there, or is not to be.
+    Ended(String),
+}
+
+/// What this run has set aside and nobody has mended since: how many of each tile.
+#[derive(Debug, Default)]
+pub(super) struct SetAside(Mutex<BTreeMap<Option<String>, u64>>);
+
+impl SetAside {
+    pub(super) fn note(&self, changes: Vec<Change>) {
+        let mut tiles = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        for change in changes {
+            match change {
+                Change::SetAside(tile) => *tiles.entry(tile).or_default() += 1,
+                Change::Ended(tile) => _ = tiles.remove(&Some(tile)),
+            }
+        }
+    }
+
+    pub(super) fn count(&self) -> u64 {
+        let tiles = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        tiles.values().sum()
+    }
+}
+
 /// What a transaction did.
 #[derive(Default)]
 pub(super) struct Done {
@@ -45,6 +76,8 @@ pub(super) struct Done {
     /// Pyramids that no tile names.
     orphans: Vec<String>,
     pub(super) notices: Vec<String>,
+    /// What it changed of what is set aside, in order.
+    pub(super) changes: Vec<Change>,
     /// Records that are another worker's now.
     lost: Vec<u64>,
 }
@@ -52,7 +85,7 @@ pub(super) struct Done {
 impl Enter<'_> {
     pub(super) async fn commit(&mut self, ready: Vec<Ready>) -> Result<(), IngestError> {
         let progress = self.context.progress;
-        let done = retry(self.options, progress, || self.transaction(&ready)).await?;
+        let mut done = retry(self.options, progress, || self.transaction(&ready)).await?;
         for notice in &done.notices {
             progress.notice(notice);
         }
@@ -65,7 +98,10 @@ impl Enter<'_> {
         self.summary.pixels += done.summary.pixels;
         self.summary.moved += done.summary.moved;
         self.summary.deleted += done.summary.deleted;
-        self.summary.quarantined += done.summary.quarantined;
+        self.context
+            .set_aside
+            .note(std::mem::take(&mut done.changes));
+        self.summary.quarantined = self.context.set_aside.count();
         self.meter.add(done.summary.pixels);
         let left = self.left.load(Ordering::Relaxed);
         let left = left.saturating_sub(ready.len() as u64);
@@ -117,6 +153,7 @@ impl Done {
                 TileOutcome::New | TileOutcome::Replaced => {
                     self.summary.tiles += 1;
                     self.summary.pixels += pixels;
+                    self.changes.push(Change::Ended(tile.name.clone()));
                 }
                 TileOutcome::Superseded => self.orphans.push(tile.pyramid.clone()),
             },
@@ -139,9 +176,12 @@ impl Done {
                 }
             }
             Outcome::Delete { record, position } => {
-                match commit.delete(&record.tile, *position, now).await? {
-                    DeleteOutcome::Deleted => self.summary.deleted += 1,
-                    DeleteOutcome::Unchanged | DeleteOutcome::Noted => {}
+                let deleted = commit.delete(&record.tile, *position, now).await?;
+                if deleted == DeleteOutcome::Deleted {
+                    self.summary.deleted += 1;
+                }
+                if deleted != DeleteOutcome::Unchanged {
+                    self.changes.push(Change::Ended(record.tile.clone()));
                 }
             }
             Outcome::Wait { waiting, .. } => commit.wait(waiting).await?,
@@ -159,7 +199,7 @@ impl Done {
         what: &Quarantined,
     ) -> Result<(), CatalogError> {
         commit.quarantine(what).await?;
-        self.summary.quarantined += 1;
+        self.changes.push(Change::SetAside(what.tile.clone()));
         let tile = what
             .tile
             .as_deref()

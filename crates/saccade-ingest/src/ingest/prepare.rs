@@ -15,17 +15,19 @@ use saccade_archive::storage::{Storage, StorageError};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, VoxelKind};
 
-use super::enter::retry;
+use super::enter::{SetAside, retry};
 use super::images::Images;
 use super::{IngestError, IngestOptions};
 use crate::progress::Progress;
-use crate::watch::BEFORE_FIRST;
+use crate::watch::{BEFORE_FIRST, Stamp};
 
 /// What a file looks like from outside; another look means that someone writes to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Look {
     pub(super) bytes: u64,
     modified: Option<SystemTime>,
+    /// When the system last noted a change: who copies a file may say that it is old.
+    changed: Option<SystemTime>,
 }
 
 /// Looks at a file; `None` if there is none, or none that may be seen.
@@ -34,6 +36,7 @@ pub(super) fn look(path: &Path) -> Option<Look> {
     Some(Look {
         bytes: metadata.len(),
         modified: metadata.modified().ok(),
+        changed: Stamp::of(&metadata).ok().and_then(|stamp| stamp.changed),
     })
 }
 
@@ -147,6 +150,7 @@ pub(super) struct Context<'a> {
     pub(super) catalog: &'a Catalog,
     pub(super) options: &'a IngestOptions,
     pub(super) progress: &'a dyn Progress,
+    pub(super) set_aside: SetAside,
 }
 
 impl Context<'_> {
@@ -257,7 +261,13 @@ impl Context<'_> {
                 kind,
             })
         };
+        // Space that was set aside and is being filled looks whole.
+        let written_to = look(&path) != before;
         let pyramid = match pyramid {
+            Ok(Ok(_)) if written_to => {
+                let reason = "it was written to while it was read".to_owned();
+                return wait(reason, WaitKind::Incomplete);
+            }
             Ok(Ok(pyramid)) => pyramid,
             Ok(Err(Refusal::Incomplete(reason))) => return wait(reason, WaitKind::Incomplete),
             Ok(Err(Refusal::Broken(reason))) => return wait(reason, WaitKind::Broken),
@@ -381,6 +391,10 @@ fn build(
         ImageError::Size { width, height, .. } if watched => Refusal::Never(format!(
             "the image has {width} x {height} pixels, but had others when it was found; rename whole images into \
              the folder"
+        )),
+        ImageError::Unsupported { what } => Refusal::Never(format!(
+            "this kind of image cannot be read ({what}); convert it to a {}-bit grey TIFF or PNG",
+            8 * stored.dtype.bytes()
         )),
         _ => Refusal::Never(e.to_string()),
     })?;

@@ -18,7 +18,7 @@ use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, retry};
+use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, SetAside, retry};
 use super::images::Images;
 use super::prepare::{Context, Outcome, Stored, quarantine};
 use super::records::patiently;
@@ -48,7 +48,7 @@ pub struct Summary {
     pub moved: u64,
     /// Tiles deleted by records that say so.
     pub deleted: u64,
-    /// Files and records put in quarantine.
+    /// Files and records put in quarantine, without those that were mended since.
     pub quarantined: u64,
     /// Transforms that wait for a tile that has not come, also those of earlier runs.
     pub early: u64,
@@ -119,6 +119,7 @@ pub async fn run(
             catalog,
             options,
             progress,
+            set_aside: SetAside::default(),
         },
         worker: &worker,
         reader,
@@ -286,7 +287,7 @@ impl Ingest<'_> {
         let read = supply.summary;
         self.summary.moved += read.moved;
         self.summary.deleted += read.deleted;
-        self.summary.quarantined += read.quarantined;
+        self.summary.quarantined = self.context.set_aside.count();
         Ok(worked)
     }
 
@@ -307,7 +308,8 @@ impl Ingest<'_> {
         for old in retired {
             match self.archive.storage().delete(&old.pyramid).await {
                 Ok(()) => deleted.push(old.pyramid),
-                // It stays on the list.
+                // They stay on the list. What is written next waits, and says so.
+                Err(e) if e.is_outage() => break,
                 Err(e) => log::warn!("cannot delete the replaced pyramid {}: {e}", old.pyramid),
             }
         }
@@ -465,6 +467,7 @@ impl Supply<'_> {
             Ok((taken, done))
         })
         .await?;
+        self.context.set_aside.note(done.changes);
         self.blocked = taken < lines.len();
         for notice in &done.notices {
             progress.notice(notice);
@@ -475,7 +478,6 @@ impl Supply<'_> {
         self.worked += at_once.count();
         self.summary.moved += done.summary.moved;
         self.summary.deleted += done.summary.deleted;
-        self.summary.quarantined += done.summary.quarantined;
         let left = queued + lines.len() as u64 + self.reader.remaining_lines();
         self.left.store(left, Ordering::Relaxed);
         Ok(taken > 0)

@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 
 use glam::{DVec2, UVec2, UVec3};
 use saccade_archive::acquisition::tile_list::{Images, ListedTile};
-use saccade_archive::image::decode_file;
+use saccade_archive::image::{Wanted, decode_file_as, read_bits};
 use saccade_core::transform::{SectionFromTile, TilePoint};
+use saccade_core::volume::Dtype;
 use tiff::decoder::Decoder;
 
 use super::ReplayError;
@@ -44,6 +45,10 @@ pub struct Acquisition {
     pub solution: Option<PathBuf>,
     /// Size that holds every tile, where the stage and where the solution says \[voxels\].
     pub extent: UVec3,
+    /// Type of voxels that holds what the images show.
+    pub dtype: Dtype,
+    /// How many images have 8 bits or fewer, where others have 16: those are spread over all 16.
+    pub shallow: usize,
     /// In the order of acquisition: by section, then as listed.
     pub tiles: Vec<RawTile>,
 }
@@ -92,11 +97,18 @@ impl Acquisition {
             });
         }
         let mut tiles = Vec::new();
+        let (mut deep, mut shallow) = (0, 0);
         for (tile, name) in listed.iter().zip(names) {
             let Some(image) = images.find(&tile.file) else {
                 continue;
             };
             let size = image_size(&image)?;
+            match read_bits(&image) {
+                Ok(..=8) => shallow += 1,
+                Ok(_) => deep += 1,
+                // Ingest finds out what is wrong, and says so.
+                Err(_) => {}
+            }
             tiles.push(RawTile {
                 name,
                 size,
@@ -114,6 +126,12 @@ impl Acquisition {
             list: list.to_owned(),
             solution: solution.map(|solution| solution.path.clone()),
             extent,
+            dtype: if deep > 0 {
+                Dtype::Uint16
+            } else {
+                Dtype::Uint8
+            },
+            shallow: if deep > 0 { shallow } else { 0 },
             tiles,
         })
     }
@@ -176,8 +194,8 @@ fn image_size(path: &Path) -> Result<UVec2, ReplayError> {
     if let Some((width, height)) = head() {
         return Ok(UVec2::new(width, height));
     }
-    match decode_file(path) {
-        Ok(image) => Ok(UVec2::new(image.width, image.height)),
+    match decode_file_as(path, Wanted::GRAY_16) {
+        Ok(image) => Ok(UVec2::from_array(image.size())),
         Err(source) => Err(ReplayError::Image {
             source,
             path: path.to_owned(),

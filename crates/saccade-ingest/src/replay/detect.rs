@@ -57,8 +57,13 @@ impl Input {
                 };
                 let (tiles, sections) = (acquisition.tiles.len(), acquisition.extent.z);
                 let list = acquisition.list.display();
+                let bits = 8 * acquisition.dtype.bytes();
+                let mixed = match acquisition.shallow {
+                    0 => String::new(),
+                    shallow => format!(" ({shallow} of 8, which are spread over the whole range)"),
+                };
                 format!(
-                    "an acquisition of {tiles} tiles in {sections} sections: {list}, {solution}"
+                    "an acquisition of {tiles} tiles of {bits} bits{mixed} in {sections} sections: {list}, {solution}"
                 )
             }
         }

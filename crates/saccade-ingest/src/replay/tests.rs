@@ -145,6 +145,53 @@ fn two_pictures() -> TempDir {
     folder
 }
 
+/// Images of 16 bits make a volume of 16 bits; those of 8 among them are said to be there.
+#[test]
+fn a_replay_has_the_depth_of_its_images() {
+    use saccade_archive::acquisition::AcquisitionInfo;
+    use saccade_core::volume::Dtype;
+    use tiff::encoder::{TiffEncoder, colortype};
+    let folder = two_pictures();
+    let deepen = |name: &str| {
+        let path = folder.path().join(format!("pictures/{name}.tif"));
+        let mut encoder = TiffEncoder::new(fs::File::create(path).unwrap()).unwrap();
+        let voxels = vec![5000; 600];
+        encoder
+            .write_image::<colortype::Gray16>(30, 20, &voxels)
+            .unwrap();
+    };
+    fs::write(
+        folder.path().join("list.txt"),
+        "a.tif 0 0 0\nb.tif 25 0 0\n",
+    )
+    .unwrap();
+    for (deep, dtype, said) in [
+        (None, Dtype::Uint8, "2 tiles of 8 bits in"),
+        (
+            Some("a"),
+            Dtype::Uint16,
+            "2 tiles of 16 bits (1 of 8, which",
+        ),
+        (Some("b"), Dtype::Uint16, "2 tiles of 16 bits in"),
+    ] {
+        if let Some(name) = deep {
+            deepen(name);
+        }
+        let input = detect(folder.path()).unwrap();
+        assert!(input.describe().contains(said), "{}", input.describe());
+        let out = tempfile::tempdir().unwrap();
+        let config = ReplayConfig {
+            rate_mpixel_s: None,
+            solution_after: Duration::ZERO,
+            ..ReplayConfig::default()
+        };
+        let (clock, cancel) = (PretendClock::default(), Cancel::new());
+        let acquisition = found(folder.path());
+        run(&config, &acquisition, out.path(), &clock, &cancel, &()).unwrap();
+        assert_eq!(AcquisitionInfo::read(out.path()).unwrap().dtype, dtype);
+    }
+}
+
 /// From the corner of tile 0 to that of tile 1: on the stage, and in the solution.
 fn steps(acquisition: &Acquisition) -> (DVec2, Option<DVec2>) {
     let corner = |transform: SectionFromTile| transform.apply(TilePoint(DVec2::ZERO)).0;

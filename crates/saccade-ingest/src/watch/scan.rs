@@ -1,22 +1,15 @@
 //! Which files are new, found with few questions to the file system.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::{HashMap, VecDeque};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use super::{Pattern, Place};
-
-/// What changes when a file does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct Stamp {
-    /// Length \[bytes\].
-    pub bytes: u64,
-    /// Last modification.
-    pub modified: SystemTime,
-}
+use super::again::Again;
+use super::stamp::Seen;
+use super::{Pattern, Place, Stamp};
 
 /// What a folder holds.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -83,11 +76,7 @@ impl Folders for Disk {
     }
 
     fn stamp(&self, file: &Path) -> io::Result<Stamp> {
-        let meta = fs::metadata(file)?;
-        Ok(Stamp {
-            bytes: meta.len(),
-            modified: meta.modified()?,
-        })
+        Stamp::of(&fs::metadata(file)?)
     }
 
     fn now(&self) -> SystemTime {
@@ -167,9 +156,16 @@ pub struct Scanner<F> {
     paths: HashMap<PathBuf, usize>,
     listing: Option<Listing>,
     /// What each file looked like, by the hash of its path.
-    files: HashMap<u64, u64>,
-    /// Files told of before this process, and not met yet by this one.
-    told: HashSet<u64>,
+    files: HashMap<u64, Seen>,
+    /// Files told of before this process, and not met yet by this one, with what they looked like, if that was
+    /// kept.
+    told: HashMap<u64, Option<Seen>>,
+    /// Files that somebody may still be writing to.
+    again: Again,
+    /// Whether all folders were gone through once.
+    went_round: bool,
+    /// Folders that could not be looked into, and why.
+    closed: HashMap<usize, io::ErrorKind>,
     /// When the last of them was told of.
     told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
@@ -199,7 +195,10 @@ impl<F: Folders> Scanner<F> {
             paths: HashMap::from([(PathBuf::new(), 0)]),
             listing: None,
             files: HashMap::new(),
-            told: HashSet::new(),
+            told: HashMap::new(),
+            again: Again::default(),
+            went_round: false,
+            closed: HashMap::new(),
             told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
             counts: Counts::default(),
@@ -241,7 +240,21 @@ impl<F: Folders> Scanner<F> {
 
     /// Says that a file was told of by an earlier process, no later than [`Self::told_until`] says.
     pub fn remember(&mut self, file: &str) {
-        self.told.insert(self.hasher.hash_one(file));
+        self.told.insert(self.hasher.hash_one(file), None);
+    }
+
+    /// Says what a file looked like when an earlier process told of it.
+    pub(super) fn remember_as(&mut self, key: u64, seen: Seen) {
+        if let Some(told) = self.told.get_mut(&key) {
+            *told = Some(seen);
+        }
+    }
+
+    /// Says that a file is told of as it looks now; what to remember it by.
+    pub(super) fn tells(&mut self, file: &str, stamp: Stamp) -> (u64, Seen) {
+        let (key, seen) = (self.hasher.hash_one(file), Seen::of(&stamp));
+        self.files.insert(key, seen);
+        (key, seen)
     }
 
     /// Says when earlier processes told of the last file.
@@ -258,6 +271,7 @@ impl<F: Folders> Scanner<F> {
     pub fn look(&mut self, budget: usize) -> io::Result<(Vec<Found>, Next)> {
         let mut found = Vec::new();
         let mut left = budget.max(1);
+        self.look_again(&mut found, &mut left);
         loop {
             if left == 0 {
                 return Ok((found, Next::More));
@@ -272,7 +286,8 @@ impl<F: Folders> Scanner<F> {
             }
             if self.to_ask == 0 {
                 self.to_ask = self.known.len();
-                let changed = std::mem::take(&mut self.changed);
+                self.went_round = true;
+                let changed = std::mem::take(&mut self.changed) || self.again.waits();
                 return Ok((found, if changed { Next::Again } else { Next::Rest }));
             }
             self.round.rotate_left(1);
@@ -289,6 +304,9 @@ impl<F: Folders> Scanner<F> {
                 let entries = changed.then(|| self.folders.list(&path)).transpose()?;
                 Ok((modified, entries))
             });
+            if asked.is_ok() && self.closed.remove(&folder).is_some() {
+                log::info!("{} can be looked into again", path.display());
+            }
             match asked {
                 Ok((modified, Some(entries))) => {
                     let age = self.folders.now().duration_since(modified);
@@ -301,7 +319,12 @@ impl<F: Folders> Scanner<F> {
                 }
                 Ok((_, None)) => {}
                 Err(e) if whole => return Err(e),
-                Err(e) => log::warn!("cannot look into {}: {e}", path.display()),
+                Err(e) => {
+                    // Once for each reason.
+                    if self.closed.insert(folder, e.kind()) != Some(e.kind()) {
+                        log::warn!("cannot look into {}: {e}", path.display());
+                    }
+                }
             }
         }
     }
@@ -369,16 +392,48 @@ impl<F: Folders> Scanner<F> {
         };
         // The pattern is text, so the path is.
         let file = below.to_string_lossy().into_owned();
-        let (key, seen) = (self.hasher.hash_one(&file), self.hasher.hash_one(stamp));
+        let (key, seen) = (self.hasher.hash_one(&file), Seen::of(&stamp));
+        if self.again.holds(key) {
+            return;
+        }
         let before = self.files.insert(key, seen);
         let told = self.told.remove(&key);
         let same = match (before, told) {
-            (Some(before), _) => before == seen,
-            (None, true) => stamp.modified <= self.told_until,
-            (None, false) => false,
+            (Some(before), _) | (None, Some(Some(before))) => !before.is_replaced_by(seen),
+            (None, Some(None)) => stamp.modified <= self.told_until,
+            (None, None) => false,
         };
+        let found_now = Found { file, place };
+        // By the clock that stamps files, which may be another than this one: what comes later is new in any case.
+        let now = self.folders.now();
+        if stamp.is_young(now) || (!same && self.went_round) {
+            self.again.add(key, &found_now, now);
+        }
         if !same {
-            found.push(Found { file, place });
+            found.push(found_now);
+        }
+    }
+
+    /// Looks at files again that somebody may still be writing to, with half of the questions at most.
+    fn look_again(&mut self, found: &mut Vec<Found>, left: &mut usize) {
+        let now = self.folders.now();
+        let mut most = left.div_ceil(2);
+        while most > 0
+            && let Some(mut file) = self.again.due(now)
+        {
+            most -= 1;
+            *left = left.saturating_sub(1);
+            let stamp = self.folders.stamp(&self.root.join(&file.found.file));
+            let known = self.files.get(&file.key).copied();
+            // One that is gone may be on its way to be another.
+            if let (Ok(stamp), Some(known)) = (stamp, known) {
+                let seen = Seen::of(&stamp);
+                if file.is_whole_again(known, seen, now) {
+                    self.files.insert(file.key, seen);
+                    found.push(file.found.clone());
+                }
+            }
+            self.again.put_back(file, now);
         }
     }
 }

@@ -71,6 +71,16 @@ fn names_say_where() {
 /// When a folder was changed, and what is in it.
 type Listed = (u64, Vec<Entry>);
 
+/// Of a file that was written then.
+fn stamp(at: u64) -> Stamp {
+    Stamp {
+        bytes: 9,
+        modified: Counted::at(at),
+        changed: None,
+        number: None,
+    }
+}
+
 /// A file system of numbers, which counts what it is asked.
 #[derive(Clone, Default)]
 struct Counted {
@@ -132,8 +142,7 @@ impl Folders for Counted {
     fn stamp(&self, file: &Path) -> io::Result<Stamp> {
         self.asked.set(self.asked.get() + 1);
         let stamps = self.stamps.lock().unwrap();
-        let modified = Self::at(stamps.get(file).copied().unwrap_or(1));
-        Ok(Stamp { bytes: 9, modified })
+        Ok(stamp(stamps.get(file).copied().unwrap_or(1)))
     }
 
     fn now(&self) -> SystemTime {
@@ -191,8 +200,7 @@ impl Folders for Vast {
 
     fn stamp(&self, _: &Path) -> io::Result<Stamp> {
         self.asked.set(self.asked.get() + 1);
-        let modified = Counted::at(1);
-        Ok(Stamp { bytes: 9, modified })
+        Ok(stamp(1))
     }
 
     fn now(&self) -> SystemTime {
@@ -632,6 +640,138 @@ fn a_file_without_its_head_is_looked_at_again() {
     std::thread::sleep(Duration::from_millis(300));
     looks(&mut watch);
     assert!(told(&kept).iter().any(|t| t.tile == "s1_r1_c2_a"));
+}
+
+/// Looks for so long, as often as it would.
+fn look_for(watch: &mut Watch<Disk>, seconds: f64) {
+    let end = SystemTime::now() + Duration::from_secs_f64(seconds);
+    while SystemTime::now() < end {
+        looks(watch);
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Copying programs set a file's space aside, and fill it.
+#[test]
+fn a_file_that_is_filled_after_it_was_told_of_is_told_of_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    let path = scope.join("s1/r1_c1_a.tif");
+    image(&path, 32, 1);
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    look_for(&mut watch, 0.5);
+    assert_eq!(told(&kept).len(), 1);
+    let bytes = fs::read(&path).unwrap();
+    for n in 0..4 {
+        // In place: its folder does not change.
+        let file = fs::OpenOptions::new().write(true).open(&path).unwrap();
+        std::os::unix::fs::FileExt::write_all_at(&file, &[n], bytes.len() as u64 - 1).unwrap();
+        look_for(&mut watch, 0.6);
+    }
+    look_for(&mut watch, 2.5);
+    // Not for each of its parts.
+    assert_eq!(told(&kept).len(), 2);
+    look_for(&mut watch, 1.5);
+    drop(watch);
+    look_for(
+        &mut Watch::open(config(), Disk, &scope, &kept).unwrap(),
+        1.5,
+    );
+    assert_eq!(told(&kept).len(), 2, "once is enough");
+}
+
+/// With the length and the time of the old one, as copying programs keep them: while it is watched, and while nobody
+/// does.
+#[test]
+fn a_file_that_is_renamed_over_another_is_told_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    let path = scope.join("s1/r1_c1_a.tif");
+    let long_ago = SystemTime::now() - Duration::from_secs(3600);
+    let replace = |value| {
+        image(&path, 32, value);
+        let file = fs::OpenOptions::new().write(true).open(&path).unwrap();
+        file.set_modified(long_ago).unwrap();
+    };
+    replace(1);
+    let mut watch = Watch::open(config(), Disk, &scope, &kept).unwrap();
+    look_for(&mut watch, 0.5);
+    replace(2);
+    look_for(&mut watch, 3.0);
+    assert_eq!(told(&kept).len(), 2);
+    drop(watch);
+    replace(3);
+    // Links and permissions are another matter.
+    looks(&mut Watch::open(config(), Disk, &scope, &kept).unwrap());
+    assert_eq!(told(&kept).len(), 3);
+    fs::hard_link(&path, folder.path().join("link")).unwrap();
+    looks(&mut Watch::open(config(), Disk, &scope, &kept).unwrap());
+    assert_eq!(told(&kept).len(), 3);
+    // As an earlier version left it: times alone count, and nothing comes again.
+    fs::remove_file(kept.join("stamps")).unwrap();
+    looks(&mut Watch::open(config(), Disk, &scope, &kept).unwrap());
+    assert_eq!(told(&kept).len(), 3);
+}
+
+/// Files are looked at again for half a minute, so many at a time, and each folder is listed no more for that.
+#[test]
+fn looks_at_young_files_are_a_part_of_the_budget_and_end() {
+    let disk = Young::default();
+    let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern("s{section}.tif"));
+    let budget = 20;
+    let mut asked = Vec::new();
+    for tick in 0..400 {
+        disk.now.set(tick);
+        scanner.look(budget).unwrap();
+        asked.push(disk.asked.take());
+    }
+    let most = asked.iter().max().unwrap();
+    assert!(*most <= budget + 2, "{most} questions");
+    // Ticks are a quarter of a second. At first all is listed; then each is asked each second.
+    let sum = |ticks: std::ops::Range<usize>| asked[ticks].iter().sum::<usize>();
+    let later = sum(60..100);
+    assert!((300..=10 * Young::FILES + 50).contains(&later), "{later}");
+    assert!(sum(360..400) <= 40, "only the folder");
+}
+
+/// Some files that have come just now, and time that passes.
+#[derive(Clone, Default)]
+struct Young {
+    now: Rc<Cell<u64>>,
+    asked: Rc<Cell<usize>>,
+}
+
+impl Young {
+    const FILES: usize = 30;
+    const BEGIN: u64 = 1_000_000;
+}
+
+impl Folders for Young {
+    fn modified(&self, _: &Path) -> io::Result<SystemTime> {
+        self.asked.set(self.asked.get() + 1);
+        Ok(Counted::at(Self::BEGIN - 10))
+    }
+
+    fn list(&self, _: &Path) -> io::Result<Box<dyn Iterator<Item = io::Result<Entry>> + Send>> {
+        self.asked.set(self.asked.get() + 1);
+        let entry = |n| {
+            Ok(Entry {
+                name: format!("s{n}.tif"),
+                folder: false,
+            })
+        };
+        Ok(Box::new((0..Self::FILES).map(entry)))
+    }
+
+    fn stamp(&self, _: &Path) -> io::Result<Stamp> {
+        self.asked.set(self.asked.get() + 1);
+        Ok(stamp(Self::BEGIN - 10))
+    }
+
+    fn now(&self) -> SystemTime {
+        Counted::at(Self::BEGIN)
+            + Duration::from_millis(250) * u32::try_from(self.now.get()).unwrap()
+    }
 }
 
 /// A list that takes so many records, and no more until there is room.

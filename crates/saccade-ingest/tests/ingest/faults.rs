@@ -8,11 +8,11 @@ use glam::UVec2;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::RecordReader;
 use saccade_archive::catalog::Catalog;
-use saccade_archive::storage::{FaultyStorage, MemoryStorage, Storage, WriteFault};
+use saccade_archive::storage::{FaultyStorage, LocalStorage, MemoryStorage, Storage, WriteFault};
 use saccade_ingest::Cancel;
-use saccade_ingest::ingest::{IngestError, run};
+use saccade_ingest::ingest::{IngestError, IngestOptions, run};
 
-use crate::scope::{Diary, Scope, VOLUME, orphans, pixels, quick, seen, texture};
+use crate::scope::{Diary, Scope, VOLUME, archive, orphans, pixels, quick, seen, texture};
 
 const SIZE: UVec2 = UVec2::new(140, 130);
 const TILES: u8 = 6;
@@ -114,10 +114,84 @@ async fn a_full_disk_is_waited_out() {
 }
 
 /// It would be there for ever: nobody but a person can take it away.
+/// As where the archive's disk is unmounted: an empty folder is in its place, and the catalog is elsewhere.
+#[tokio::test]
+async fn an_archive_whose_disk_is_away_is_waited_for() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let [root, away] = ["root", "away"].map(|name| folder.path().join(name));
+    let catalog = Catalog::create(&folder.path().join("catalog.sqlite")).await;
+    let storage = Arc::new(LocalStorage::new(&root).unwrap());
+    let archive = VisualizationArchive::from_parts(catalog.unwrap(), storage);
+    scope.tile("t0", 0, SIZE, 0);
+    assert_eq!(scope.ingest(&archive).await.tiles, 1);
+
+    fs::rename(&root, &away).unwrap();
+    fs::create_dir(&root).unwrap();
+    scope.tile("t1", 1, SIZE, 1);
+    let (diary, cancel, options) = (Diary::default(), Cancel::new(), quick());
+    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
+    let back = async {
+        let why = loop {
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            if let Some(why) = diary.held_up() {
+                break why;
+            }
+        };
+        assert!(why.contains("is its disk mounted?"), "{why}");
+        let entry = archive.catalog().entry(VOLUME).await.unwrap();
+        assert_eq!(entry.tiles, 1, "nothing is acknowledged");
+        assert_eq!(fs::read_dir(&root).unwrap().count(), 0);
+        fs::remove_dir(&root).unwrap();
+        fs::rename(&away, &root).unwrap();
+    };
+    let both = async { tokio::join!(ingest, back) };
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+    assert_eq!(both.expect("it goes on").0.unwrap().tiles, 1);
+    assert_eq!(diary.held_up(), None);
+    let tiles = seen(&archive).await;
+    for n in 0..2 {
+        let tile = &tiles[&format!("t{n}")];
+        assert_eq!(pixels(tile).await, texture(SIZE, n));
+    }
+    assert!(orphans(&archive).await.is_empty());
+}
+
+/// A file whose space is set aside first, and then filled.
+#[tokio::test]
+async fn a_file_that_is_filled_while_it_is_read_is_waited_for() {
+    const LARGE: UVec2 = UVec2::new(1200, 1000);
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    let bytes = scope.image("t", LARGE, 7);
+    // The head, and none of the pixels.
+    let mut half = bytes.clone();
+    half[1000..1_199_000].fill(0);
+    let path = scope.file("t");
+    fs::write(&path, half).unwrap();
+    scope.say(&crate::scope::tile_record("t", 0, LARGE));
+    let fill = std::thread::spawn(move || {
+        let file = fs::OpenOptions::new().write(true).open(path).unwrap();
+        for (n, part) in bytes.chunks(5_000).enumerate() {
+            let at = u64::try_from(n * 5_000).unwrap();
+            std::os::unix::fs::FileExt::write_all_at(&file, part, at).unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    });
+    let options = IngestOptions {
+        patience: 1000,
+        ..quick()
+    };
+    let done = run(scope.path(), &archive, &options, &(), &Cancel::new()).await;
+    assert_eq!(done.unwrap().tiles, 1);
+    fill.join().unwrap();
+    let tile = seen(&archive).await.remove("t").unwrap();
+    assert!(pixels(&tile).await == texture(LARGE, 7), "half of it");
+}
+
 #[tokio::test]
 async fn a_folder_in_the_place_of_a_pyramid_is_told_and_holds_nothing_up() {
     let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
-    let archive = crate::scope::archive(folder.path()).await;
+    let archive = archive(folder.path()).await;
     let position = fs::metadata(scope.path().join(RecordReader::FILE)).map_or(0, |meta| meta.len());
     let pyramid = format!("tiles/{VOLUME}/000000/a-{position:x}.tif");
     let occupied = folder.path().join(&pyramid);

@@ -69,6 +69,8 @@ async fn sixteen_bits_arrive_as_they_left() {
     fs::write(scope.file("deep"), file.into_inner()).unwrap();
     scope.say(&tile_record("deep", 0, SIZE));
     scope.tile("flat", 1, SIZE, 7);
+    fs::write(scope.file("other"), "GIF89a and so on").unwrap();
+    scope.say(&tile_record("other", 2, SIZE));
 
     // JPEG, as far as that goes: it is said that it does not.
     let options = IngestOptions {
@@ -84,6 +86,8 @@ async fn sixteen_bits_arrive_as_they_left() {
         archive.catalog().volume(VOLUME).await.unwrap().dtype,
         Dtype::Uint16
     );
+    let advice = "convert it to a 16-bit grey TIFF or PNG";
+    assert!(notices.iter().any(|n| n.contains(advice)), "{notices:?}");
 
     let storage = archive.storage().as_ref();
     let flat: Vec<u16> = texture(SIZE, 7)

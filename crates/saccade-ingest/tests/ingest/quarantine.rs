@@ -355,3 +355,31 @@ async fn a_mended_tile_leaves_quarantine() {
     );
     assert_eq!(pixels(&seen(&archive).await["a"]).await, texture(SIZE, 5));
 }
+
+/// By the same run: what is told is what is set aside now.
+#[tokio::test]
+async fn a_tile_that_is_mended_meanwhile_is_not_counted_as_set_aside() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    for name in ["bad", "worse"] {
+        fs::write(scope.file(name), tiff16(SIZE)).unwrap();
+    }
+    scope.say(&tile_record("worse", 0, SIZE));
+    let Record::Tile(bad) = tile_record("bad", 0, SIZE) else {
+        unreachable!()
+    };
+    let tile = "a".to_owned();
+    scope.say(&Record::Tile(TileRecord { tile, ..bad }));
+    scope.tile("a", 0, SIZE, 5);
+    let diary = Diary::default();
+    let options = saccade_ingest::ingest::IngestOptions {
+        workers: 1,
+        ..quick()
+    };
+    let done = run(scope.path(), &archive, &options, &diary, &Cancel::new()).await;
+    let done = done.unwrap();
+    assert_eq!((done.tiles, done.quarantined), (1, 1));
+    let states = diary.states();
+    assert_eq!(states.last().unwrap().quarantined, 1);
+    assert!(states.iter().any(|state| state.quarantined == 2));
+}

@@ -193,9 +193,11 @@ async fn say_what_is_left(
             Some(tile) => format!("{} (tile {tile})", one.file),
             None => one.file.clone(),
         });
-        say(&format!(
-            "set aside, for reasons told above and by /v/{volume}/status.json of `saccade serve`: {named}"
-        ));
+        if !named.is_empty() {
+            say(&format!(
+                "set aside, for reasons told above and by /v/{volume}/status.json of `saccade serve`: {named}"
+            ));
+        }
     }
     let waiting = catalog.waiting(volume).await?;
     if !waiting.is_empty() {

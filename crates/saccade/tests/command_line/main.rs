@@ -10,6 +10,7 @@ mod labels;
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;
 mod server_away;
+mod store_away;
 mod whole_way;
 
 use std::ffi::OsStr;

@@ -26,7 +26,7 @@ fn lines(from: impl std::io::Read + Send + 'static) -> Receiver<String> {
 }
 
 /// Waits for a line that holds this.
-fn says(lines: &Receiver<String>, what: &str) -> String {
+pub(super) fn says(lines: &Receiver<String>, what: &str) -> String {
     let mut before = Vec::new();
     while let Ok(line) = lines.recv_timeout(PATIENCE) {
         if line.contains(what) {
@@ -37,16 +37,21 @@ fn says(lines: &Receiver<String>, what: &str) -> String {
     panic!("it does not say {what:?}, but {before:#?}");
 }
 
-struct Program {
+pub(super) struct Program {
     running: Running,
     stdout: Receiver<String>,
-    stderr: Receiver<String>,
+    pub(super) stderr: Receiver<String>,
 }
 
 impl Program {
     fn start(arguments: &[&str]) -> Self {
+        Self::start_with(arguments, &[])
+    }
+
+    /// With variables of its environment.
+    pub(super) fn start_with(arguments: &[&str], environment: &[(&str, &str)]) -> Self {
         let mut command = saccade();
-        command.args(arguments);
+        command.args(arguments).envs(environment.iter().copied());
         let mut child: Child = { command.stdout(Stdio::piped()).stderr(Stdio::piped()) }
             .spawn()
             .unwrap();
@@ -57,12 +62,16 @@ impl Program {
         }
     }
 
-    fn ends_well(mut self) {
+    fn ends_well(self) {
+        self.ends_with(0);
+    }
+
+    pub(super) fn ends_with(mut self, code: i32) {
         let until = SystemTime::now() + PATIENCE;
         while SystemTime::now() < until {
             if let Some(status) = self.running.0.try_wait().unwrap() {
                 let said: Vec<_> = self.stderr.try_iter().collect();
-                assert!(status.success(), "{said:#?}");
+                assert_eq!(status.code(), Some(code), "{said:#?}");
                 return;
             }
             std::thread::sleep(Duration::from_millis(20));
@@ -71,7 +80,7 @@ impl Program {
     }
 }
 
-fn text(path: &Path) -> &str {
+pub(super) fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 

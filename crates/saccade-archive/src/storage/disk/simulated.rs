@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use bytes::Bytes;
 use tokio::sync::watch;
 
-use super::{DirEntry, Disk, Metadata, OpenFile};
+use super::{DirEntry, Disk, FolderId, Metadata, OpenFile};
 
 /// A file system in memory whose power can be cut after any step.
 ///
@@ -454,6 +454,11 @@ impl Disk for SimulatedDisk {
             len,
             modified: None,
         })
+    }
+
+    fn folder_id(&self, path: &Path) -> io::Result<Option<FolderId>> {
+        let number = self.powered()?.find(path)? as u64;
+        Ok(Some(FolderId { device: 0, number }))
     }
 
     fn read_dir(&self, path: &Path) -> io::Result<Vec<DirEntry>> {

@@ -1,0 +1,125 @@
+//! What files looked like when they were told of, kept beside the records, so that a later process knows which were
+//! replaced meanwhile. It is of use and not needed: where it is missing, their times alone are asked.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufReader, Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use super::stamp::Seen;
+
+/// Name of the file: sixteen bytes for each time that a file was told of, of which the last counts.
+const FILE: &str = "stamps";
+
+/// Bytes of an entry.
+const ENTRY: usize = 16;
+
+#[derive(Debug)]
+pub(super) struct Stamps {
+    path: PathBuf,
+    /// Whether it was said that they cannot be kept.
+    warned: bool,
+}
+
+impl Stamps {
+    pub(super) fn new(kept: &Path) -> Self {
+        Self {
+            path: kept.join(FILE),
+            warned: false,
+        }
+    }
+
+    /// Forgets all, because the files were moved.
+    pub(super) fn forget(&self) {
+        match fs::remove_file(&self.path) {
+            Err(e) if e.kind() != io::ErrorKind::NotFound => {
+                log::warn!("cannot remove {}: {e}", self.path.display());
+            }
+            Ok(()) | Err(_) => {}
+        }
+    }
+
+    /// All entries, in order.
+    pub(super) fn each(&self, mut take: impl FnMut(u64, Seen)) {
+        let Ok(file) = File::open(&self.path) else {
+            return;
+        };
+        let mut file = BufReader::new(file);
+        let mut entry = [0; ENTRY];
+        while file.read_exact(&mut entry).is_ok() {
+            let bits = u128::from_le_bytes(entry);
+            take(
+                (bits >> 64) as u64,
+                Seen::from_bits((bits & u128::from(u64::MAX)) as u64),
+            );
+        }
+    }
+
+    /// Adds entries. Without them files may be told of once more, or not, which is no reason to stop.
+    pub(super) fn add(&mut self, entries: &[(u64, Seen)]) {
+        if entries.is_empty() {
+            return;
+        }
+        let entry = |(key, seen): &(u64, Seen)| {
+            (u128::from(*key) << 64 | u128::from(seen.to_bits())).to_le_bytes()
+        };
+        let bytes: Vec<u8> = entries.iter().flat_map(entry).collect();
+        match self.append(&bytes) {
+            Ok(()) => self.warned = false,
+            Err(e) if !self.warned => {
+                self.warned = true;
+                log::warn!("cannot write {}: {e}", self.path.display());
+            }
+            Err(_) => {}
+        }
+    }
+
+    fn append(&self, bytes: &[u8]) -> io::Result<()> {
+        let mut options = OpenOptions::new();
+        let mut file = options.append(true).create(true).open(&self.path)?;
+        let len = file.metadata()?.len();
+        // A writer that died may have left half an entry.
+        let half = len % ENTRY as u64;
+        if half > 0 {
+            file.set_len(len - half)?;
+        }
+        file.write_all(bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::SystemTime;
+
+    use super::super::Stamp;
+    use super::*;
+
+    #[test]
+    fn entries_outlive_half_a_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut stamps = Stamps::new(folder.path());
+        let seen = |bytes| {
+            Seen::of(&Stamp {
+                bytes,
+                modified: SystemTime::UNIX_EPOCH,
+                changed: None,
+                number: Some(bytes),
+            })
+        };
+        let all = || {
+            let mut all = Vec::new();
+            Stamps::new(folder.path()).each(|key, seen| all.push((key, seen)));
+            all
+        };
+        assert_eq!(all(), []);
+        let entries = [(u64::MAX, seen(1)), (7, seen(2)), (7, seen(3))];
+        stamps.add(&entries[..2]);
+        let mut bytes = fs::read(&stamps.path).unwrap();
+        bytes.extend([1, 2, 3]);
+        fs::write(&stamps.path, bytes).unwrap();
+        assert_eq!(all(), entries[..2]);
+        stamps.add(&entries[2..]);
+        assert_eq!(all(), entries);
+        stamps.forget();
+        assert_eq!(all(), []);
+    }
+}
