@@ -41,7 +41,7 @@
 //! |---|---|
 //! | 404 | no such volume, level or chunk, or nothing was acquired there: the fill value |
 //! | 304, 412, 416 | what a client's own conditions ask for |
-//! | 503 with `Retry-After` | not ready, or a failure that may pass; `cause` says which |
+//! | 503 with `Retry-After` | not ready, or a failure that may pass, which `cause` names |
 //! | 503 with `Retry-After`, also | more connections, requests or event streams at once than [`Limits`] allow |
 //! | 421, 403 | a name that the server does not have, an origin that it does not let read ([`Access`]) |
 //! | 424 | what the voxels are read from is damaged: `cause` says what, and asking again does not help |

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use futures::StreamExt;
 use glam::UVec3;
@@ -12,6 +12,7 @@ use saccade_core::voxel_box::VoxelBox;
 use saccade_source::{ChunkId, VolumeSource};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tokio::time::Instant;
 
 use crate::history::{Cursor, History};
 use crate::http::Tag;

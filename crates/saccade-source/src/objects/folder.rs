@@ -205,6 +205,7 @@ mod tests {
 
     use super::*;
 
+    #[expect(clippy::unwrap_used, reason = "a helper of tests")]
     fn read(objects: &FolderObjects, key: &str) -> Result<Option<Bytes>, ObjectError> {
         let runtime = tokio::runtime::Builder::new_current_thread().build();
         let read = objects.read(key, Part::Whole { most: 100 });
