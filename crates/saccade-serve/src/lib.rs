@@ -24,6 +24,9 @@
 //! Below `at/VERSION` they are what they are now, too; those that have not changed since that
 //! version may be kept for good.
 //!
+//! Of labels whose ids the volume's type has no room for, answers with voxels carry `saccade-renamed-label: ID` as soon as such an id
+//! was met by anybody: it is another number there, which others may share.
+//!
 //! # Spaces and shapes
 //!
 //! In OME-Zarr arrays are `[c, z, y, x]` with chunks of `[1, cz, cy, cx]`; this is where x, y, z
@@ -38,7 +41,7 @@
 //! |---|---|
 //! | 404 | no such volume, level or chunk, or nothing was acquired there: the fill value |
 //! | 304, 412, 416 | what a client's own conditions ask for |
-//! | 503 with `Retry-After` | not ready, or a failure that may pass |
+//! | 503 with `Retry-After` | not ready, or a failure that may pass, which `cause` names |
 //! | 503 with `Retry-After`, also | more connections, requests or event streams at once than [`Limits`] allow |
 //! | 421, 403 | a name that the server does not have, an origin that it does not let read ([`Access`]) |
 //! | 424 | what the voxels are read from is damaged: `cause` says what, and asking again does not help |

@@ -12,6 +12,7 @@ use futures::future::try_join_all;
 use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
+use saccade_source::remote::RENAMED_LABEL;
 use saccade_source::{Chunk, ChunkError, ChunkId};
 
 use crate::formats::Piece;
@@ -27,10 +28,25 @@ const DAMAGED: StatusCode = StatusCode::FAILED_DEPENDENCY;
 /// Its address names its state: it will never be anything else.
 const KEEP: HeaderValue = HeaderValue::from_static("public, max-age=86400, immutable");
 
-/// Reads an object's voxels, within `patience`, and answers as the request's conditions ask.
+/// Reads an object's voxels, within `patience`, and answers as the request's conditions ask. As soon as an id of labels is known that
+/// is another number in the volume, every answer names it.
 ///
 /// `version` is the version of the volume that the address names, if any.
 pub(crate) async fn piece(
+    published: &Published,
+    piece: &Piece,
+    version: Option<&str>,
+    headers: &HeaderMap,
+    patience: Duration,
+) -> Response {
+    let mut response = conditional(published, piece, version, headers, patience).await;
+    if let Some(id) = published.source.renamed_label() {
+        response.headers_mut().insert(RENAMED_LABEL, id.into());
+    }
+    response
+}
+
+async fn conditional(
     published: &Published,
     piece: &Piece,
     version: Option<&str>,
@@ -52,7 +68,7 @@ pub(crate) async fn piece(
             );
         }
         Ok(Err(error)) => return failed(published, &error),
-        Err(_) => return try_again("the chunk takes long", Duration::from_secs(1)),
+        Err(_) => return late(published, place, patience),
     };
     // A change during the read leaves open which state this is: then it goes without a tag.
     let tag = Some(tag).filter(|tag| published.tag(place) == *tag);
@@ -134,6 +150,20 @@ fn answer(voxels: Bytes, tag: Option<&Tag>, cache: HeaderValue, request: &Header
         response.extensions_mut().insert(Compressible::Large);
     }
     response
+}
+
+/// The answer where a source has not delivered in time.
+fn late(published: &Published, (level, chunk): (u32, UVec3), patience: Duration) -> Response {
+    let error = format!("level {level} chunk {chunk} takes long");
+    let seconds = patience.as_secs_f32();
+    let cause = format!(
+        "level {level} chunk {chunk} was not read within {seconds} s: what it is read from answers slowly or not at all, or \
+         more is asked for than can be done"
+    );
+    if published.is_to_tell_of_late() {
+        log::warn!("volume {:?}: {cause}", published.volume().name);
+    }
+    failing(error, cause, Some(Duration::from_secs(1)), DAMAGED)
 }
 
 /// The answer where a source could not deliver.

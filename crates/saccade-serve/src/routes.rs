@@ -9,15 +9,16 @@ use std::time::Duration;
 use axum::extract::{ConnectInfo, Path, Request, State};
 use axum::http::header::{
     ACCEPT_RANGES, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_RANGE, ETAG, HeaderMap,
-    RETRY_AFTER,
+    RANGE, RETRY_AFTER,
 };
-use axum::http::{Extensions, Method, StatusCode, Uri, Version};
-use axum::middleware::{Next, from_fn_with_state, map_response};
+use axum::http::{Extensions, HeaderName, Method, StatusCode, Uri, Version};
+use axum::middleware::{Next, from_fn_with_state, map_request, map_response};
 use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use saccade_core::volume::Dtype;
 use saccade_source::ChunkId;
+use saccade_source::remote::RENAMED_LABEL;
 use tokio::sync::{Semaphore, watch};
 use tower_http::CompressionLevel;
 use tower_http::compression::CompressionLayer;
@@ -88,6 +89,7 @@ pub(crate) fn router(app: App) -> Router {
             CONTENT_RANGE,
             ETAG,
             RETRY_AFTER,
+            HeaderName::from_static(RENAMED_LABEL),
         ])
         .max_age(Duration::from_secs(86_400));
     let marked = |_: StatusCode, _: Version, _: &HeaderMap, extensions: &Extensions| {
@@ -130,6 +132,7 @@ pub(crate) fn router(app: App) -> Router {
         .route("/v/{name}/thumbnail.png", get(picture))
         .route("/v/{name}/ranges/{channel}/{level}/{chunks}", get(ranges))
         .fallback(get(other))
+        .layer(map_request(whole_heads))
         .layer(from_fn_with_state(app.clone(), spare_near_clients))
         .layer(gzip)
         .layer(map_response(mark_encoding))
@@ -151,6 +154,14 @@ async fn admit(State(app): State<App>, request: Request, next: Next) -> Response
 
 fn too_much(error: &str) -> Response {
     try_again(error, Duration::from_secs(1))
+}
+
+/// A part is asked for with GET only; of the whole is what every other answer tells.
+async fn whole_heads(mut request: Request) -> Request {
+    if request.method() != Method::GET {
+        request.headers_mut().remove(RANGE);
+    }
+    request
 }
 
 /// Compression costs a client on the same computer more than it saves.
@@ -310,6 +321,7 @@ async fn list(State(app): State<App>, headers: HeaderMap) -> Response {
     responses(
         (status = 200, body = Vec<u8>, content_type = "image/png"),
         (status = 404, body = Refusal, description = "no such volume, or nothing was acquired yet"),
+        (status = 424, body = Refusal, description = "what it is drawn from is damaged; asking again does not help"),
         (status = 503, body = Refusal, description = "not ready; ask again after Retry-After")
     )
 )]

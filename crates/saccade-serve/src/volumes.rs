@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
+use std::time::Duration;
 
 use futures::StreamExt;
 use glam::UVec3;
@@ -11,10 +12,14 @@ use saccade_core::voxel_box::VoxelBox;
 use saccade_source::{ChunkId, VolumeSource};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tokio::time::Instant;
 
 use crate::history::{Cursor, History};
 use crate::http::Tag;
 use crate::status::StatusSource;
+
+/// Between two messages that chunks of a volume take long.
+const TELL_AGAIN: Duration = Duration::from_secs(60);
 
 /// The volumes on offer, by name. Clones share the same set, which may grow at any time.
 #[derive(Clone, Default)]
@@ -77,6 +82,8 @@ pub(crate) struct Published {
     /// Position behind the last change, for those who wait for the next.
     end: watch::Receiver<u64>,
     follower: JoinHandle<()>,
+    /// When it was told last that a chunk takes long.
+    told_of_late: Mutex<Option<Instant>>,
 }
 
 impl Published {
@@ -113,7 +120,18 @@ impl Published {
             history,
             end,
             follower,
+            told_of_late: Mutex::new(None),
         }
+    }
+
+    /// Whether it should be told now that a chunk takes long: where one does, most do.
+    pub(crate) fn is_to_tell_of_late(&self) -> bool {
+        let mut told = { self.told_of_late.lock() }.unwrap_or_else(PoisonError::into_inner);
+        let is_due = told.is_none_or(|told| told.elapsed() >= TELL_AGAIN);
+        if is_due {
+            *told = Some(Instant::now());
+        }
+        is_due
     }
 
     pub(crate) fn volume(&self) -> &Arc<Volume> {
@@ -194,4 +212,23 @@ impl Drop for Published {
 /// A history is valid after every step: a panic elsewhere cannot have left it half-changed.
 fn lock(history: &Mutex<History>) -> MutexGuard<'_, History> {
     history.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+    use saccade_source::memory::ArraySource;
+
+    #[tokio::test]
+    async fn that_chunks_take_long_is_not_told_of_each() {
+        let volume = Volume::new("v", UVec3::ONE, DVec3::ONE).unwrap();
+        let source = Arc::new(ArraySource::new(volume, vec![1]).unwrap());
+        let published = Published::new(source, None);
+        let told = (0..100).filter(|_| published.is_to_tell_of_late());
+        assert_eq!(told.count(), 1);
+        let before = Instant::now().checked_sub(TELL_AGAIN);
+        *published.told_of_late.lock().unwrap() = before;
+        assert!(published.is_to_tell_of_late());
+    }
 }

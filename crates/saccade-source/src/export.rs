@@ -11,8 +11,11 @@
 //!
 //! The group's description, without which nobody takes the folder for an image, comes last. Until then
 //! `export.json` says what is being written; the same export begun again keeps the shards that are there, if the
-//! volume has not changed since; once the image is whole, its attribute `saccade` says the same, and nothing is done again. What changes while it is exported is exported again, until all is of one
-//! state.
+//! volume has not changed since; once the image is whole, its attribute `saccade` says the same, and how many shards there are. Begun
+//! once more, nothing is done where all of them are there; what is missing is exported again. What changes while it is exported is
+//! exported again, until all is of one state.
+//!
+//! What was begun without letting ids of labels become others may go on with it: the shards that are there have only ids that fit.
 //!
 //! # Memory
 //!
@@ -43,6 +46,8 @@ pub const UNFINISHED: &str = "export.json";
 const GROUP: &str = "zarr.json";
 /// Attribute of it that says which export it is.
 const OURS: &str = "saccade";
+/// How many shards there are, in it.
+const SHARDS: &str = "shards";
 /// Shards at a time: one is read while the other is compressed and written.
 const SHARDS_AT_ONCE: usize = 2;
 
@@ -208,13 +213,18 @@ pub async fn export(
         progress(state);
         return Ok(state);
     }
+    // Shards that are objects.
+    let mut full = BTreeSet::new();
     if begun == Begun::Partly {
-        let mut there = BTreeSet::new();
-        for level in 0..plan.levels.len() {
-            there.extend(storage.list(&format!("{level}/c/")).await?);
-        }
-        all.retain(|shard| !there.contains(&shard.key()));
-        state.kept = state.shards - all.len() as u64;
+        let there = there(storage, &plan).await?;
+        all.retain(|shard| {
+            let missing = !there.contains(&shard.key());
+            if !missing {
+                full.insert(*shard);
+            }
+            missing
+        });
+        state.kept = full.len() as u64;
         state.done = state.kept;
     }
     progress(state);
@@ -230,12 +240,16 @@ pub async fn export(
                     if let Some(id) = source.renamed_label().filter(|_| !plan.rename_labels) {
                         return Err(ExportError::Label { id });
                     }
-                    write(storage, &shard.key(), bytes).await
+                    Ok((shard, write(storage, &shard.key(), bytes).await?))
                 }
             })
             .buffer_unordered(SHARDS_AT_ONCE);
-        while let Some(bytes) = written.next().await {
-            let bytes = bytes?;
+        while let Some(done) = written.next().await {
+            let (shard, bytes) = done?;
+            match bytes {
+                0 => full.remove(&shard),
+                _ => full.insert(shard),
+            };
             state.done += 1;
             state.empty += u64::from(bytes == 0);
             state.bytes += bytes;
@@ -264,6 +278,7 @@ pub async fn export(
     }
     let mut group = plan.group();
     group["attributes"][OURS] = state_of(&plan, revision);
+    group["attributes"][OURS][SHARDS] = full.len().into();
     storage.write_durable(GROUP, pretty(&group)).await?;
     storage.delete(UNFINISHED).await?;
     Ok(state)
@@ -293,31 +308,63 @@ async fn json(storage: &dyn Storage, key: &str) -> Result<Option<serde_json::Val
     }
 }
 
+/// Names of the objects that the levels of an export have.
+async fn there(storage: &dyn Storage, plan: &Plan) -> Result<BTreeSet<String>, ExportError> {
+    let mut there = BTreeSet::new();
+    for level in 0..plan.levels.len() {
+        there.extend(storage.list(&format!("{level}/")).await?);
+    }
+    Ok(there)
+}
+
+/// Whether all of an export is there that had so many shards when it was whole.
+async fn is_whole(
+    storage: &dyn Storage,
+    plan: &Plan,
+    shards: Option<u64>,
+) -> Result<bool, ExportError> {
+    let there = there(storage, plan).await?;
+    let arrays = (0..plan.levels.len()).all(|level| there.contains(&format!("{level}/zarr.json")));
+    let found = { plan.shards() }.filter(|shard| there.contains(&shard.key()));
+    Ok(arrays && shards == Some(found.count() as u64))
+}
+
 /// Says what is being written, unless all of it is there.
 async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<Begun, ExportError> {
     let ours = state_of(plan, revision);
     if let Some(begun) = json(storage, UNFINISHED).await? {
-        if begun["export"] != ours["export"] {
+        if !plan::goes_on(&begun["export"], &ours["export"]) {
             let differences = plan::differences(&begun["export"], &ours["export"]);
             return Err(ExportError::Other { differences });
         }
-        if begun == ours {
+        if begun["revision"] == ours["revision"] {
+            if begun != ours {
+                // From now on ids may become others.
+                storage.write_durable(UNFINISHED, pretty(&ours)).await?;
+            }
             return Ok(Begun::Partly);
         }
         // It may have been whole but for the end of this object: no image while it is written anew.
         storage.delete(GROUP).await?;
     } else if let Some(group) = json(storage, GROUP).await? {
         let there = &group["attributes"][OURS];
-        if there["export"] != ours["export"] {
+        if !plan::goes_on(&there["export"], &ours["export"]) {
             return Err(ExportError::Exists);
         }
-        return match there["revision"].as_u64().unwrap_or_default() {
-            there if there == revision => Ok(Begun::Whole),
-            there => Err(ExportError::Outdated {
-                there,
+        let of = there["revision"].as_u64().unwrap_or_default();
+        if of != revision {
+            return Err(ExportError::Outdated {
+                there: of,
                 now: revision,
-            }),
-        };
+            });
+        }
+        if is_whole(storage, plan, there[SHARDS].as_u64()).await? {
+            return Ok(Begun::Whole);
+        }
+        // Somebody took a part of it away: no image until that is there again.
+        storage.write_durable(UNFINISHED, pretty(&ours)).await?;
+        storage.delete(GROUP).await?;
+        return Ok(Begun::Partly);
     } else if !storage.list("").await?.is_empty() {
         return Err(ExportError::Exists);
     }

@@ -94,7 +94,8 @@ impl PrecomputedSource {
         if offset != [0; 3] {
             let [x, y, z] = offset;
             notes.push(format!(
-                "its first voxel is {x}, {y}, {z} elsewhere, and 0, 0, 0 here (voxel_offset)"
+                "its first voxel is {x}, {y}, {z} elsewhere, and 0, 0, 0 here (voxel_offset); its place is kept where it is served or \
+                 exported"
             ));
         }
         for (scale, level) in info.scales.iter().zip(&volume.levels) {

@@ -8,6 +8,7 @@ mod ranges;
 mod status;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -27,6 +28,9 @@ use client::client;
 
 pub use status::{Quarantined, Status, StatusReader};
 
+/// Header of a server's answers that names an id of labels which is another number in the volume, once it has met one: see
+/// [`VolumeSource::renamed_label`].
+pub const RENAMED_LABEL: &str = "saccade-renamed-label";
 /// Largest chunk a server may announce \[bytes\].
 const LARGEST_CHUNK: u64 = 1 << 28;
 
@@ -137,6 +141,8 @@ pub struct RemoteSource {
     options: RemoteOptions,
     changes: Arc<Changes>,
     revisions: Arc<Revisions>,
+    /// What the server says of [`RENAMED_LABEL`]; 0 for nothing so far.
+    renamed: AtomicU64,
     events: AbortHandle,
 }
 
@@ -232,6 +238,7 @@ impl RemoteSource {
             options,
             changes,
             revisions,
+            renamed: AtomicU64::new(0),
             events,
         })
     }
@@ -274,6 +281,11 @@ impl VolumeSource for RemoteSource {
 
     fn changes(&self) -> BoxStream<'static, Change> {
         self.changes.stream()
+    }
+
+    fn renamed_label(&self) -> Option<u64> {
+        let id = self.renamed.load(Ordering::Relaxed);
+        (id != 0).then_some(id)
     }
 
     fn find_value_range(

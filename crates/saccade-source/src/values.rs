@@ -182,9 +182,15 @@ impl Values {
             Way::Less(less) => Some(format!(
                 "its values are {number}; they are shown in 16 bit less {less}, which loses nothing of those looked at"
             )),
-            Way::Window(Spread { min, max }) => Some(format!(
-                "its values are {number}; those from {min} to {max} are shown in 65535 steps, what lies beyond as the ends"
-            )),
+            Way::Window(Spread { min, max }) => {
+                let none = match number.is_whole() {
+                    true => "",
+                    false => ", and what is no number (NaN) as nothing measured",
+                };
+                Some(format!(
+                    "its values are {number}; those from {min} to {max} are shown in 65535 steps, what lies beyond as the ends{none}"
+                ))
+            }
             Way::Names if number.bytes() <= 2 => None,
             Way::Names => Some(format!(
                 "its values are names of things ({number}); up to 65535 they are shown as they are, each larger one as one of \
@@ -429,12 +435,14 @@ mod tests {
         assert!((3.0 * factor + shift - 65_535.0).abs() < 1e-6);
         let note = values.note().unwrap();
         assert!(
-            note.contains("float32") && note.contains("-1 to 3"),
+            note.contains("float32") && note.contains("-1 to 3") && note.contains("(NaN)"),
             "{note}"
         );
         let u32s = [0_u32, 1 << 31, 1 << 20].map(|v| v.to_le_bytes().to_vec());
         let values = fitted(Number::U32, 0.0, f64::from(1_u32 << 31));
         assert_eq!(shown(&values, u32s), [1, 65_535, 33]);
+        let note = values.note().unwrap();
+        assert!(!note.contains("NaN"), "{note}");
         assert!(fitted(Number::F64, 2.0, 2.0).scale().0.is_finite());
     }
 

@@ -62,7 +62,7 @@ use array::Array;
 use error::Refusal;
 pub use error::ZarrError;
 use image::{LevelArray, ZarrImage};
-use metadata::Image;
+use metadata::{Axis, Image};
 pub(crate) use packing::Packing;
 
 /// Size of the chunks that a volume is read in \[voxels\]: some bricks, whatever the file's own are.
@@ -129,6 +129,7 @@ impl ZarrSource {
         let rank = arrays.first().map_or(0, |array| array.shape.len());
         let mut image = Image::parse(ome, rank).map_err(here)?;
         let whole = { arrays.first() }.is_some_and(|array| array.number.is_whole());
+        image.notes.extend(times(&image.axes, &arrays));
         let is_plain = whole && !image.is_labels && ome["omero"].is_null();
         if is_plain && lies_in_labels(&objects.folders()) {
             image.is_labels = true;
@@ -143,9 +144,6 @@ impl ZarrSource {
         let volume = volume(name, &image, &mut levels).map_err(here)?;
         let mut notes = std::mem::take(&mut image.notes);
         notes.extend(levels.iter().filter_map(LevelArray::note));
-        if !image.has_size {
-            notes.push("the image does not say how large its voxels are; they are taken for 1 micrometer where it does not".to_owned());
-        }
         let labels = labels(&*objects).await;
         if !labels.is_empty() {
             let first = &labels[0];
@@ -221,6 +219,15 @@ async fn array_of(objects: &dyn Objects, path: &str) -> Result<Array, ZarrError>
         Err(Refusal::wrong("a level is listed, but is no array"))
     };
     array.map_err(|refusal| refusal.at(objects.location(path)))
+}
+
+/// What a user should know of times that are not shown.
+fn times(axes: &[Axis], arrays: &[Array]) -> Option<String> {
+    let time = axes.iter().position(|axis| *axis == Axis::T)?;
+    let count = *arrays.first()?.shape.get(time)?;
+    (count > 1).then(|| {
+        format!("it has {count} times (axis t); the first is shown, and the others cannot be yet")
+    })
 }
 
 /// Names of an image's labels. That they cannot be read is no reason not to show the image.

@@ -62,7 +62,7 @@ fn main() -> ExitCode {
             Command::Serve(serve) => done(serve.run().await),
             Command::View(view) => done(view.run().await),
             Command::Render(render) => done(render.run().await),
-            Command::Export(export) => done(export.run().await),
+            Command::Export(export) => export.run().await,
             Command::Check(check) => check.run().await,
         }
     });

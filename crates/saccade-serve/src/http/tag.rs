@@ -28,11 +28,13 @@ impl Tag {
 
     /// The answer to conditions that make a body needless: 304 or 412.
     pub(crate) fn precondition(&self, headers: &HeaderMap) -> Option<Response> {
-        if headers.contains_key(IF_MATCH) && self.named_in(headers, IF_MATCH).is_none() {
+        // Weak tags are of what is as good, which is not enough to go on with.
+        let strong = |item: &str| !item.starts_with("W/");
+        if headers.contains_key(IF_MATCH) && self.named_in(headers, IF_MATCH, strong).is_none() {
             return Some(StatusCode::PRECONDITION_FAILED.into_response());
         }
         // The client's own spelling goes back: it says which encoding it holds.
-        let held = self.named_in(headers, IF_NONE_MATCH)?;
+        let held = self.named_in(headers, IF_NONE_MATCH, |_| true)?;
         let tag = if held == "*" {
             self.header()
         } else {
@@ -46,13 +48,19 @@ impl Tag {
         *value == self.header()
     }
 
-    /// The item of a list header that names this state, without quotes, or `*`.
-    fn named_in<'h>(&self, headers: &'h HeaderMap, header: HeaderName) -> Option<&'h str> {
+    /// The item of a list header, of those that count, that names this state, without quotes, or `*`.
+    fn named_in<'h>(
+        &self,
+        headers: &'h HeaderMap,
+        header: HeaderName,
+        counts: impl Fn(&str) -> bool,
+    ) -> Option<&'h str> {
         let lines = headers
             .get_all(header)
             .iter()
             .filter_map(|line| line.to_str().ok());
         let items = lines.flat_map(|line| line.split(',')).map(str::trim);
+        let items = items.filter(|item| counts(item));
         let opaque = items.map(|item| item.strip_prefix("W/").unwrap_or(item).trim_matches('"'));
         opaque
             .into_iter()
@@ -113,7 +121,12 @@ mod tests {
             answer(IF_MATCH, "\"a-8\""),
             Some(StatusCode::PRECONDITION_FAILED)
         );
+        assert_eq!(
+            answer(IF_MATCH, "W/\"a-7\""),
+            Some(StatusCode::PRECONDITION_FAILED)
+        );
         assert_eq!(answer(IF_MATCH, "\"a-7\""), None);
+        assert_eq!(answer(IF_MATCH, "W/\"a-7\", \"a-7-gzip\""), None);
         assert_eq!(answer(IF_MATCH, "*"), None);
     }
 }

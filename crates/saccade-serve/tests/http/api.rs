@@ -105,6 +105,8 @@ fn answers_are_what_the_document_says() {
             let path = path.replace("{channel}/{level}/{chunks}", "0/1/0,0,0;0,0,0");
             path.trim_start_matches('/').to_owned()
         };
+        let picture = &document["paths"]["/v/{name}/thumbnail.png"]["get"]["responses"];
+        assert!(picture["424"].is_object(), "{picture}");
         for path in described {
             let response = served.get(&filled(path, "em")).await;
             assert_eq!(response.status(), StatusCode::OK, "{path}");

@@ -185,6 +185,17 @@ fn heads_have_no_body() {
         assert_eq!(header(response.headers(), "accept-ranges"), Some("bytes"));
         assert!(response.headers().contains_key("etag"));
         assert!(response.bytes().await.unwrap().is_empty());
+        // Parts are asked for with GET only.
+        for range in ["bytes=0-9", "bytes=99999999-"] {
+            let part = served
+                .request(Method::HEAD, &key(0, HERE))
+                .header(RANGE, range)
+                .send()
+                .await
+                .unwrap();
+            assert_eq!(part.status(), StatusCode::OK, "{range}");
+            assert_eq!(part.headers()[CONTENT_LENGTH], *length, "{range}");
+        }
         let empty = served
             .request(Method::HEAD, &key(0, UVec3::ZERO))
             .send()

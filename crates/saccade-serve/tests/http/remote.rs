@@ -1,21 +1,27 @@
 //! The client that Saccade itself uses.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use futures::FutureExt;
 use glam::UVec3;
+use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_serve::Options;
 use saccade_source::conformance::{check_changes, check_reading};
-use saccade_source::remote::RemoteSource;
-use saccade_source::{ChunkId, SourceError, VolumeSource};
+use saccade_source::maybe_send::{BoxFuture, BoxStream};
+use saccade_source::memory::ArraySource;
+use saccade_source::remote::{RENAMED_LABEL, RemoteSource};
+use saccade_source::{Change, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
 
-use super::{CHUNK, Served, run, serve};
+use super::{CHUNK, Served, level0, run, serve, serve_source, volume};
 
 /// A chunk as the array has it, by way of no server.
 fn truth(served: &Served, id: ChunkId) -> Vec<u8> {
     let read = served.source.read(id).now_or_never().unwrap().unwrap();
     match read {
-        saccade_source::Chunk::Voxels(voxels) => voxels.to_vec(),
-        saccade_source::Chunk::Empty => vec![0; CHUNK.element_product() as usize],
+        Chunk::Voxels(voxels) => voxels.to_vec(),
+        Chunk::Empty => vec![0; CHUNK.element_product() as usize],
     }
 }
 
@@ -55,6 +61,70 @@ fn a_remote_source_follows() {
         check_changes(&remote, 4, change, |id| truth(&served, id), 0)
             .await
             .unwrap();
+    });
+}
+
+/// Labels of which one has no room in the volume.
+struct Wide {
+    labels: ArraySource,
+    /// The chunk that has it.
+    there: UVec3,
+    met: AtomicBool,
+}
+
+impl VolumeSource for Wide {
+    fn volume(&self) -> &Arc<Volume> {
+        self.labels.volume()
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        if id.chunk == self.there {
+            self.met.store(true, Ordering::SeqCst);
+        }
+        self.labels.read(id)
+    }
+
+    fn renamed_label(&self) -> Option<u64> {
+        self.met.load(Ordering::SeqCst).then_some(70_000)
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.labels.changes()
+    }
+}
+
+#[test]
+fn ids_that_a_server_renames_are_known_where_they_are_read() {
+    run(async {
+        let there = UVec3::new(1, 1, 1);
+        let source = Arc::new(Wide {
+            labels: ArraySource::new(volume(), level0()).unwrap(),
+            there,
+            met: AtomicBool::new(false),
+        });
+        let (url, _stop, _) = serve_source(source, Options::DEFAULT).await;
+        let remote = RemoteSource::open(&url, "em").await.unwrap();
+        let id = |chunk| ChunkId {
+            channel: 0,
+            level: 0,
+            chunk,
+        };
+        remote.read(id(UVec3::new(0, 1, 1))).await.unwrap();
+        assert_eq!(remote.renamed_label(), None, "none was met yet");
+        remote.read(id(there)).await.unwrap();
+        assert_eq!(remote.renamed_label(), Some(70_000));
+        // What was kept elsewhere says it as well, also where nothing is read again.
+        let path = format!("{url}v/em/zarr/0/c/0/1/1/1");
+        let client = reqwest::Client::new();
+        let first = client.get(&path).send().await.unwrap();
+        let held = client
+            .get(&path)
+            .header("if-none-match", &first.headers()["etag"]);
+        let held = held.send().await.unwrap();
+        assert_eq!(held.status(), reqwest::StatusCode::NOT_MODIFIED);
+        for answer in [first, held] {
+            assert_eq!(answer.headers()[RENAMED_LABEL], "70000");
+        }
     });
 }
 

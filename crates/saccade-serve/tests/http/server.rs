@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures::StreamExt;
+use glam::UVec3;
 use reqwest::StatusCode;
 use saccade_archive::catalog::{CatalogError, CatalogLocation};
 use saccade_core::volume::Volume;
@@ -179,6 +180,19 @@ fn trouble_says_whether_to_ask_again() {
             assert_eq!(header(response.headers(), "retry-after"), retry);
             let refusal: Value = serde_json::from_slice(&response.bytes().await.unwrap()).unwrap();
             assert!(refusal["error"].is_string());
+            if trouble(ChunkId {
+                channel: 0,
+                level: 0,
+                chunk: UVec3::ZERO,
+            })
+            .is_none()
+            {
+                let cause = refusal["cause"].as_str().unwrap();
+                assert!(
+                    cause.contains("level 0 chunk [0, 0, 0]") && cause.contains("0.02 s"),
+                    "{cause}"
+                );
+            }
         }
     });
 }

@@ -232,6 +232,16 @@ impl Plan {
     }
 }
 
+/// Whether what was begun there, or is there, may be what is begun now, both as [`Plan::description`] has them: the same, or the same
+/// without other numbers for ids of labels, so that its shards have only ids that fit.
+pub(super) fn goes_on(there: &Value, now: &Value) -> bool {
+    let mut strict = now.clone();
+    if let Some(strict) = strict.as_object_mut() {
+        strict.remove("renamed");
+    }
+    there == now || *there == strict
+}
+
 /// What is told of an export.
 type Fact<'a> = dyn Fn(&Value) -> String + 'a;
 

@@ -339,14 +339,82 @@ fn ids_without_room_are_not_written() {
         rename_labels: true,
         ..options.clone()
     };
-    let other = run(export(&source(), &storage, &allowed, &|_| {})).unwrap_err();
-    assert!(
-        other.to_string().contains("renamed: false there, true now"),
-        "{other}"
-    );
-    run(export(&source(), &MemoryStorage::new(), &allowed, &|_| {})).unwrap();
+    // What was written has only ids that fit, so that it is kept.
+    let coarse = run(storage.list("1/c/")).unwrap().len() as u64;
+    let done = run(export(&source(), &storage, &allowed, &|_| {})).unwrap();
+    assert!(coarse > 0 && done.kept >= coarse, "{done:?}");
+    let fresh = MemoryStorage::new();
+    run(export(&source(), &fresh, &allowed, &|_| {})).unwrap();
+    assert!(image(&storage) == image(&fresh));
     let narrow: Arc<dyn VolumeSource> = Formula::new(0, true);
     run(export(&narrow, &MemoryStorage::new(), &options, &|_| {})).unwrap();
+}
+
+/// Without a word nobody's ids become others, also not where somebody had allowed it before.
+#[test]
+fn what_may_have_other_ids_is_not_gone_on_with_as_if_it_had_not() {
+    let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
+    let source: Arc<dyn VolumeSource> = Formula::with_ids(0, true, Some((70_000, 0)));
+    let allowed = ExportOptions {
+        rename_labels: true,
+        ..ExportOptions::default()
+    };
+    storage.fail_write(3, WriteFault::Fail);
+    run(export(&source, &storage, &allowed, &|_| {})).unwrap_err();
+    let strict = ExportOptions::default();
+    let other = run(export(&source, &storage, &strict, &|_| {})).unwrap_err();
+    assert!(
+        other.to_string().contains("renamed: true there, false now"),
+        "{other}"
+    );
+    run(export(&source, &storage, &allowed, &|_| {})).unwrap();
+    let taken = run(export(&source, &storage, &strict, &|_| {})).unwrap_err();
+    assert!(matches!(taken, ExportError::Exists), "{taken:?}");
+
+    // One that is whole though it was not allowed is what it would be if it were, also begun before and gone on with.
+    let narrow: Arc<dyn VolumeSource> = Formula::new(0, true);
+    let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
+    storage.fail_write(3, WriteFault::Fail);
+    run(export(&narrow, &storage, &strict, &|_| {})).unwrap_err();
+    storage.fail_write(1, WriteFault::Fail);
+    run(export(&narrow, &storage, &allowed, &|_| {})).unwrap_err();
+    let other = run(export(&narrow, &storage, &strict, &|_| {})).unwrap_err();
+    assert!(matches!(other, ExportError::Other { .. }), "{other:?}");
+    let storage = MemoryStorage::new();
+    run(export(&narrow, &storage, &strict, &|_| {})).unwrap();
+    let again = run(export(&narrow, &storage, &allowed, &|_| {})).unwrap();
+    assert!(again.was_whole);
+}
+
+/// That it was whole once does not mean that it is.
+#[test]
+fn what_was_taken_from_a_whole_export_is_exported_again() {
+    let source: Arc<dyn VolumeSource> = Formula::new(0, true);
+    let region = VoxelBox::new(UVec3::ZERO, UVec3::new(75, 53, 3));
+    let options = ExportOptions {
+        region: Some(region),
+        ..ExportOptions::default()
+    };
+    let storage = MemoryStorage::new();
+    let again = || run(export(&source, &storage, &options, &|_| {})).unwrap();
+    let first = again();
+    assert!(
+        first.empty > 0,
+        "what holds nothing is not missed: {first:?}"
+    );
+    let whole = image(&storage);
+    assert!(again().was_whole);
+    let shards = run(storage.list("0/c/1/")).unwrap();
+    run(storage.delete(&shards[0])).unwrap();
+    let mended = again();
+    assert!(!mended.was_whole && mended.bytes > 0, "{mended:?}");
+    assert_eq!(mended.kept + mended.empty + 1, mended.shards);
+    assert!(image(&storage) == whole);
+    assert!(again().was_whole);
+    run(storage.delete("1/zarr.json")).unwrap();
+    let mended = again();
+    assert_eq!((mended.was_whole, mended.bytes), (false, 0));
+    assert!(image(&storage) == whole && again().was_whole);
 }
 
 #[test]

@@ -81,7 +81,12 @@ async fn what_is_not_there_is_none(store: &dyn Objects) {
     for key in ["a/b/eleven", "none", "a/b", "a/b/ten/more"] {
         for part in [Part::Whole { most: 10 }, Part::Range(0..4), Part::Last(4)] {
             let got = store.read(key, part.clone()).await;
-            assert!(matches!(got, Ok(None)), "{key} {part:?}: {got:?}");
+            let is_none = match &got {
+                // Where there are folders, one is no object, but not nothing.
+                Err(ObjectError::NoFile { .. }) => key == "a/b",
+                got => matches!(got, Ok(None)),
+            };
+            assert!(is_none, "{key} {part:?}: {got:?}");
         }
     }
 }

@@ -61,6 +61,14 @@ pub enum ObjectError {
         /// File or address.
         location: String,
     },
+    /// Something lies in its place that is not read.
+    #[error("{what}: {location}")]
+    NoFile {
+        /// What it is, and how to mend it.
+        what: &'static str,
+        /// File.
+        location: String,
+    },
     /// The system cannot read a file.
     #[error("cannot read {location}")]
     Io {
@@ -82,6 +90,7 @@ impl ObjectError {
             | Self::Unavailable { location, .. }
             | Self::Replaced { location }
             | Self::TooLong { location, .. }
+            | Self::NoFile { location, .. }
             | Self::TooShort { location, .. } => location,
         };
         let whole = self.to_string();

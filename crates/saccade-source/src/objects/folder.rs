@@ -1,7 +1,7 @@
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Component, Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use bytes::Bytes;
 use tokio::sync::Semaphore;
@@ -12,10 +12,18 @@ use crate::maybe_send::BoxFuture;
 /// Files that are read at once: a disk is kept busy by fewer, and each takes a thread.
 const AT_ONCE: usize = 16;
 
-/// Files below a folder. Links are followed: the folder is its owner's.
+const FOLDER: &str = "there is a folder, or something else that is no file, in its place";
+const LEADS_OUT: &str = "it is a link, or lies behind one, that leads out of the image's folder, where nothing is read; copy what it \
+     leads to in its place";
+const LEADS_NOWHERE: &str = "it is a link to something that is not there";
+
+/// Files below a folder. Links are followed as long as they stay in it: whoever made an image that was copied from somewhere does
+/// not choose which files of this computer are shown. The folder itself may be a link.
 #[derive(Clone, Debug)]
 pub struct FolderObjects {
     folder: PathBuf,
+    /// Where that is without links, once it was there.
+    real: Arc<OnceLock<PathBuf>>,
     reads: Arc<Semaphore>,
 }
 
@@ -24,6 +32,7 @@ impl FolderObjects {
     pub fn new(folder: &Path) -> Self {
         Self {
             folder: folder.to_owned(),
+            real: Arc::default(),
             reads: Arc::new(Semaphore::new(AT_ONCE)),
         }
     }
@@ -35,11 +44,18 @@ impl FolderObjects {
                 location: self.folder.display().to_string(),
             });
         }
-        let path = self.folder.join(key);
+        let (folder, real, path) = (
+            self.folder.clone(),
+            self.real.clone(),
+            self.folder.join(key),
+        );
         // The semaphore is never closed. A read that nobody waits for any more keeps its place until it ends.
         let place = self.reads.clone().acquire_owned().await.ok();
         let read = tokio::task::spawn_blocking(move || {
             let _place = place;
+            let Some(path) = inside(&folder, &real, &path)? else {
+                return Ok(None);
+            };
             read_part(&path, &part)
         });
         match read.await {
@@ -52,30 +68,72 @@ impl FolderObjects {
     }
 }
 
-fn read_part(path: &Path, part: &Part) -> Result<Option<Bytes>, ObjectError> {
-    let location = || path.display().to_string();
-    let failed = |source: io::Error| match source.kind() {
+fn failed(source: io::Error, path: &Path) -> ObjectError {
+    let location = path.display().to_string();
+    match source.kind() {
         ErrorKind::PermissionDenied => ObjectError::Denied {
             advice: "check the file's owner and permissions",
-            location: location(),
+            location,
         },
-        _ => ObjectError::Io {
-            source,
-            location: location(),
-        },
+        _ => ObjectError::Io { source, location },
+    }
+}
+
+fn is_missing(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
+}
+
+/// Where a file below a folder is without links; `None` if there is none. `real` is what was found of the folder.
+fn inside(
+    folder: &Path,
+    real: &OnceLock<PathBuf>,
+    path: &Path,
+) -> Result<Option<PathBuf>, ObjectError> {
+    let refused = |what| {
+        Err(ObjectError::NoFile {
+            what,
+            location: path.display().to_string(),
+        })
     };
+    let found = match fs::canonicalize(path) {
+        Ok(found) => found,
+        Err(error) if is_missing(&error) => {
+            let is_link = fs::symlink_metadata(path).is_ok_and(|found| found.is_symlink());
+            return match is_link {
+                true => refused(LEADS_NOWHERE),
+                false => Ok(None),
+            };
+        }
+        Err(error) => return Err(failed(error, path)),
+    };
+    let folder = match real.get() {
+        Some(real) => real,
+        None => {
+            let found = fs::canonicalize(folder).map_err(|error| failed(error, folder))?;
+            real.get_or_init(|| found)
+        }
+    };
+    if !found.starts_with(folder) {
+        return refused(LEADS_OUT);
+    }
+    // Before it is opened: that of a pipe waits for a writer.
+    match fs::metadata(&found) {
+        Ok(metadata) if !metadata.is_file() => refused(FOLDER),
+        Ok(_) => Ok(Some(found)),
+        Err(error) if is_missing(&error) => Ok(None),
+        Err(error) => Err(failed(error, path)),
+    }
+}
+
+fn read_part(path: &Path, part: &Part) -> Result<Option<Bytes>, ObjectError> {
+    let location = || path.display().to_string();
+    let failed = |source: io::Error| failed(source, path);
     let mut file = match File::open(path) {
         Ok(file) => file,
-        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-            return Ok(None);
-        }
+        Err(error) if is_missing(&error) => return Ok(None),
         Err(error) => return Err(failed(error)),
     };
-    let metadata = file.metadata().map_err(failed)?;
-    if metadata.is_dir() {
-        return Ok(None);
-    }
-    let length = metadata.len();
+    let length = file.metadata().map_err(failed)?.len();
     let wanted = match part {
         Part::Whole { most } if length > *most => {
             return Err(ObjectError::TooLong {
@@ -138,5 +196,74 @@ impl Objects for FolderObjects {
 
     fn is_remote(&self) -> bool {
         false
+    }
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    #[expect(clippy::unwrap_used, reason = "a helper of tests")]
+    fn read(objects: &FolderObjects, key: &str) -> Result<Option<Bytes>, ObjectError> {
+        let runtime = tokio::runtime::Builder::new_current_thread().build();
+        let read = objects.read(key, Part::Whole { most: 100 });
+        { runtime }.unwrap().block_on(read)
+    }
+
+    #[test]
+    fn links_are_followed_as_long_as_they_stay_inside() {
+        let root = tempfile::tempdir().unwrap();
+        let (image, link) = (root.path().join("image"), root.path().join("link"));
+        fs::create_dir_all(image.join("0/c")).unwrap();
+        fs::create_dir(root.path().join("image-secret")).unwrap();
+        fs::write(root.path().join("image-secret/file"), "secret").unwrap();
+        fs::write(image.join("0/c/0"), "chunk").unwrap();
+        symlink("0", image.join("0/c/1")).unwrap();
+        symlink(image.join("0"), image.join("1")).unwrap();
+        symlink(&image, &link).unwrap();
+        let out = [
+            ("0/c/2", root.path().join("image-secret/file")),
+            ("0/c/3", "../../../image-secret/file".into()),
+            ("2", root.path().join("image-secret")),
+        ];
+        for (name, target) in &out {
+            symlink(target, image.join(name)).unwrap();
+        }
+        symlink("2/file", image.join("3")).unwrap();
+        // A folder may be named by a link, and by way of one.
+        for folder in [&image, &link, &root.path().join("link/../image")] {
+            let objects = FolderObjects::new(folder);
+            for inside in ["0/c/0", "0/c/1", "1/c/1"] {
+                let got = read(&objects, inside).unwrap();
+                assert_eq!(got.as_deref(), Some(&b"chunk"[..]), "{inside}");
+            }
+            for outside in ["0/c/2", "0/c/3", "2/file", "3", "1/c/3"] {
+                let error = read(&objects, outside).unwrap_err();
+                let named = error.to_string();
+                assert!(
+                    named.contains("leads out") && named.contains(outside),
+                    "{named}"
+                );
+                assert!(!error.is_transient() && !error.without_place().contains("secret"));
+            }
+            assert!(matches!(read(&objects, "2/none"), Ok(None)));
+        }
+    }
+
+    #[test]
+    fn what_is_no_file_is_not_taken_for_missing() {
+        let root = tempfile::tempdir().unwrap();
+        fs::create_dir_all(root.path().join("c/0")).unwrap();
+        symlink("nowhere", root.path().join("c/1")).unwrap();
+        let objects = FolderObjects::new(root.path());
+        for (key, says) in [("c/0", "a folder"), ("c/1", "not there")] {
+            let named = read(&objects, key).unwrap_err().to_string();
+            assert!(named.contains(says) && named.contains(key), "{named}");
+        }
+        for missing in ["c/2", "d/0", "c/0/0"] {
+            assert!(matches!(read(&objects, missing), Ok(None)), "{missing}");
+        }
     }
 }

@@ -1,5 +1,6 @@
 //! Chunks by HTTP.
 
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -8,7 +9,7 @@ use futures::StreamExt;
 use reqwest::{StatusCode, Url, header};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::{RemoteError, RemoteSource, joined, refusal, within};
+use super::{RENAMED_LABEL, RemoteError, RemoteSource, joined, refusal, within};
 use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId};
 
 /// When to ask again, where the server does not say.
@@ -97,6 +98,9 @@ impl RemoteSource {
         };
         let answer = self.client.get(url.clone()).send();
         let answer = within(idle, &url, answer).await?.map_err(http)?;
+        if let Some(id) = renamed_label(answer.headers()) {
+            self.renamed.store(id, Ordering::Relaxed);
+        }
         match answer.status() {
             StatusCode::OK => {}
             StatusCode::NOT_FOUND => return Ok(Answer::Empty),
@@ -142,6 +146,11 @@ fn chunk_url(volume: &Url, id: ChunkId, revision: u64) -> Url {
     let mut url = joined(volume, &["zarr", level, "c", channel, z, y, x]);
     url.set_query(Some(&format!("r={revision}")));
     url
+}
+
+/// An id of labels that is another number in the server's volume, if it has met one.
+fn renamed_label(headers: &header::HeaderMap) -> Option<u64> {
+    headers.get(RENAMED_LABEL)?.to_str().ok()?.parse().ok()
 }
 
 fn retry_after(headers: &header::HeaderMap) -> Duration {

@@ -11,6 +11,22 @@ const MOST_CHUNK: u64 = 1 << 30;
 /// Chunks that a shard may have: its index must be read before any of them.
 const MOST_IN_SHARD: u64 = 1 << 22;
 
+/// What version 3 says of an array, and what is often said of groups and means nothing here.
+const KNOWN: [&str; 12] = [
+    "zarr_format",
+    "node_type",
+    "shape",
+    "data_type",
+    "chunk_grid",
+    "chunk_key_encoding",
+    "fill_value",
+    "codecs",
+    "attributes",
+    "storage_transformers",
+    "dimension_names",
+    "consolidated_metadata",
+];
+
 /// How numbers become the bytes of a chunk.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Encoding {
@@ -107,6 +123,16 @@ impl Array {
             .is_some_and(|node| node != "array")
         {
             return Err(Refusal::wrong("a level is listed, but is no array"));
+        }
+        let understood = |(key, value): (&String, &Value)| {
+            KNOWN.contains(&key.as_str()) || value["must_understand"] == false
+        };
+        if let Some((key, _)) =
+            { json.as_object().into_iter().flatten() }.find(|one| !understood(*one))
+        {
+            return Err(Refusal::Unsupported(format!(
+                "it has {key:?}, which is not known, and does not say that this does not matter (must_understand)"
+            )));
         }
         let transformers = json["storage_transformers"].as_array();
         if transformers.is_some_and(|list| !list.is_empty()) {

@@ -24,8 +24,6 @@ pub(super) struct Image {
     pub(super) axes: Vec<Axis>,
     /// Voxel size of the finest level \[nm\].
     pub(super) voxel_nm: DVec3,
-    /// Whether the metadata say so.
-    pub(super) has_size: bool,
     /// Finest voxels per voxel, by level, where transformations tell.
     pub(super) downsampling: Vec<Option<DVec3>>,
     /// How far all of it is moved \[nm\].
@@ -168,14 +166,16 @@ impl Image {
         let of_all = { space.of_all }.map(|transformations| way(&axes, transformations));
         let of_all = of_all.transpose()?;
         let moved = { of_all.as_ref() }.map_or(DVec3::ZERO, |way| way.first);
-        let of_all = { of_all.and_then(|way| way.scale) }.unwrap_or(DVec3::ONE);
+        let of_all = of_all.and_then(|way| way.scale);
+        let says_scale = of_all.is_some();
+        let of_all = of_all.unwrap_or(DVec3::ONE);
         let begin = ways.first().map_or(DVec3::ZERO, |way| way.first);
         let finest = ways.first().and_then(|way| way.scale);
-        let units = named.and_then(|named| units(named, &axes));
+        let units = units(named.map_or(&[][..], |named| named), &axes);
         let says_size = finest.is_some() || placed.first().is_some_and(|list| space::stays(list));
-        let has_size = says_size && units.is_some();
         let finest = finest.unwrap_or(DVec3::ONE);
-        let units = units.unwrap_or(DVec3::splat(1e3));
+        let size_note = units.note(says_size || says_scale);
+        let units = units.nm;
         let mut voxel_nm = finest * of_all * units;
         let origin_nm = (begin * of_all + moved) * units;
         if !axes.contains(&Axis::Space(2)) {
@@ -192,6 +192,7 @@ impl Image {
         let downsampling = |way: &Way| Some(way.scale? / finest).filter(|d| d.is_finite());
         let channels = ome["omero"]["channels"].as_array().into_iter().flatten();
         let mut notes = space.notes;
+        notes.extend(size_note);
         notes.extend(version(ome).filter(|version| !is_known(version)).map(|version| {
             format!(
                 "it is of version {version:?} of OME-Zarr, and {} are known here: what newer ones say differently is \
@@ -200,7 +201,6 @@ impl Image {
         }));
         Ok(Self {
             voxel_nm,
-            has_size,
             origin_nm,
             downsampling: ways.iter().map(downsampling).collect(),
             first: { ways.iter() }
@@ -319,7 +319,11 @@ fn way(axes: &[Axis], transformations: &Value) -> Result<Way, Refusal> {
                     "a translation has no number for each axis (coordinateTransformations)";
                 Refusal::wrong(reason)
             })?;
-        } else if let Some(by) = numbers(&one["scale"], 1.0) {
+        } else if one["type"] == "scale" || !one["scale"].is_null() {
+            let by = numbers(&one["scale"], 1.0).ok_or_else(|| {
+                let reason = "a scale has no number for each axis (coordinateTransformations)";
+                Refusal::wrong(reason)
+            })?;
             first *= by;
             scale = Some(scale.unwrap_or(DVec3::ONE) * by);
         }
@@ -327,27 +331,100 @@ fn way(axes: &[Axis], transformations: &Value) -> Result<Way, Refusal> {
     Ok(Way { scale, first })
 }
 
-/// Nanometres in the units of x, y, z; `None` where one has none.
-fn units(named: &[Value], axes: &[Axis]) -> Option<DVec3> {
-    let mut units: [Option<f64>; 3] = [None; 3];
-    for (axis, value) in axes.iter().zip(named) {
-        if let Axis::Space(axis) = axis {
-            units[*axis] = Some(nm_per(value["unit"].as_str()?)?);
-        }
-    }
-    let [x, y, z] = units;
-    Some(DVec3::new(x?, y?, z.or(x)?))
+/// Units of the axes of space.
+struct Units {
+    /// Nanometres in those of x, y, z; in micrometres where not all are known.
+    nm: DVec3,
+    /// Their names, different ones once.
+    names: Vec<String>,
+    /// Whether all are known; z may have none, and has that of x.
+    complete: bool,
+    /// Names that are not known.
+    unknown: Vec<String>,
 }
 
+impl Units {
+    /// What a user should know of how large voxels are taken to be.
+    fn note(&self, says_scale: bool) -> Option<String> {
+        let names = self.names.join(", ");
+        if !self.unknown.is_empty() {
+            let unknown = self.unknown.join(", ");
+            return Some(format!(
+                "lengths are said in units that are not known: {unknown}; all are taken for micrometers"
+            ));
+        }
+        if !self.complete {
+            return Some(
+                "the image does not say how large its voxels are; they are taken for 1 micrometer where it does not"
+                    .to_owned(),
+            );
+        }
+        let taken =
+            "the image does not say how large its voxels are (scale); voxels are taken for 1";
+        (!says_scale).then(|| format!("{taken} {names}"))
+    }
+}
+
+fn units(named: &[Value], axes: &[Axis]) -> Units {
+    let mut nm: [Option<f64>; 3] = [None; 3];
+    let (mut names, mut unknown) = (Vec::new(), Vec::new());
+    for (axis, value) in axes.iter().zip(named) {
+        if let (Axis::Space(axis), Some(unit)) = (axis, value["unit"].as_str()) {
+            nm[*axis] = nm_per(unit);
+            let list = match nm[*axis] {
+                Some(_) => &mut names,
+                None => &mut unknown,
+            };
+            let name = match nm[*axis] {
+                Some(_) => unit.to_owned(),
+                None => format!("{unit:?}"),
+            };
+            if !list.contains(&name) {
+                list.push(name);
+            }
+        }
+    }
+    let known = match nm {
+        [Some(x), Some(y), z] if unknown.is_empty() => Some(DVec3::new(x, y, z.unwrap_or(x))),
+        _ => None,
+    };
+    Units {
+        nm: known.unwrap_or(DVec3::splat(1e3)),
+        names,
+        complete: known.is_some(),
+        unknown,
+    }
+}
+
+/// Nanometres in a unit of length of the specification.
 fn nm_per(unit: &str) -> Option<f64> {
     Some(match unit {
-        "angstrom" => 0.1,
+        "yoctometer" => 1e-15,
+        "zeptometer" => 1e-12,
+        "attometer" => 1e-9,
+        "femtometer" => 1e-6,
         "picometer" => 1e-3,
+        "angstrom" => 0.1,
         "nanometer" => 1.0,
         "micrometer" | "micron" => 1e3,
         "millimeter" => 1e6,
         "centimeter" => 1e7,
+        "inch" => 2.54e7,
+        "decimeter" => 1e8,
+        "foot" => 3.048e8,
+        "yard" => 9.144e8,
         "meter" => 1e9,
+        "hectometer" => 1e11,
+        "kilometer" => 1e12,
+        "mile" => 1.609_344e12,
+        "megameter" => 1e15,
+        "gigameter" => 1e18,
+        "terameter" => 1e21,
+        "petameter" => 1e24,
+        "parsec" => 3.085_677_581_491_367e25,
+        "exameter" => 1e27,
+        "zettameter" => 1e30,
+        "yottameter" => 1e33,
         _ => return None,
     })
 }

@@ -278,6 +278,98 @@ fn any_axes_in_any_order_of_any_type() {
     }
 }
 
+/// An image of several times, none of which but the first is seen: whoever opens it should know.
+#[test]
+fn times_that_are_not_shown_are_told() {
+    let notes = |times: u32| {
+        let folder = tempfile::tempdir().unwrap();
+        write_image(folder.path(), "tzyx", "uint8", Version::V3);
+        for level in 0..2 {
+            let file = folder.path().join(format!("s{level}/zarr.json"));
+            let mut array: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+            array["shape"][0] = times.into();
+            fs::write(&file, array.to_string()).unwrap();
+        }
+        open(folder.path()).unwrap().notes().join(" ")
+    };
+    let told = notes(7);
+    assert!(
+        told.contains("7 times") && told.contains("the first is shown"),
+        "{told}"
+    );
+    assert_eq!(notes(1), "");
+}
+
+/// Notes and voxel size of an image whose attributes were edited.
+fn sized(edit: impl Fn(&mut Value)) -> (String, DVec3) {
+    let folder = tempfile::tempdir().unwrap();
+    write_image(folder.path(), "zyx", "uint8", Version::V3);
+    let mut attributes = attributes("zyx", 2);
+    edit(&mut attributes["multiscales"][0]);
+    write_attributes(folder.path(), Version::V3, &attributes);
+    let source = open(folder.path()).unwrap();
+    (source.notes().join(" "), source.volume().voxel_nm)
+}
+
+#[test]
+fn units_are_those_of_the_specification_and_others_are_told() {
+    for (unit, nm) in [
+        ("yoctometer", 1e-15),
+        ("femtometer", 1e-6),
+        ("angstrom", 0.1),
+        ("nanometer", 1.0),
+        ("inch", 25.4e6),
+        ("foot", 12.0 * 25.4e6),
+        ("yard", 36.0 * 25.4e6),
+        ("kilometer", 1e12),
+        ("mile", 1760.0 * 36.0 * 25.4e6),
+        ("yottameter", 1e33),
+    ] {
+        let (notes, voxel_nm) = sized(|image| {
+            for n in 0..3 {
+                image["axes"][n]["unit"] = unit.into();
+            }
+        });
+        assert_eq!(notes, "", "{unit}");
+        let want = DVec3::new(0.25, 0.25, 2.0) * nm;
+        assert!(
+            (voxel_nm / want - 1.0).abs().max_element() < 1e-9,
+            "{unit}: {voxel_nm}"
+        );
+    }
+    let (notes, voxel_nm) = sized(|image| image["axes"][1]["unit"] = "furlong".into());
+    assert!(
+        notes.contains("not known: \"furlong\"") && notes.contains("micrometers"),
+        "{notes}"
+    );
+    assert_eq!(voxel_nm, DVec3::new(250.0, 250.0, 2000.0));
+}
+
+#[test]
+fn what_is_not_said_of_a_size_is_told() {
+    let without = |image: &mut Value| {
+        for level in 0..2 {
+            image["datasets"][level]["coordinateTransformations"] = json!([]);
+        }
+    };
+    let (notes, voxel_nm) = sized(without);
+    assert!(notes.contains("are taken for 1 micrometer"), "{notes}");
+    assert_eq!(voxel_nm, DVec3::splat(1000.0));
+    let (notes, voxel_nm) = sized(|image| {
+        without(image);
+        for n in 0..3 {
+            image["axes"][n]["unit"] = "nanometer".into();
+        }
+    });
+    assert!(
+        notes.contains("(scale)") && notes.ends_with("voxels are taken for 1 nanometer"),
+        "{notes}"
+    );
+    assert_eq!(voxel_nm, DVec3::ONE);
+    let (notes, _) = sized(|image| image["axes"] = json!(["z", "y", "x"]));
+    assert!(notes.contains("1 micrometer where it does not"), "{notes}");
+}
+
 fn refusal(folder: &Path) -> String {
     let error = open(folder).unwrap_err();
     std::error::Error::source(&error).unwrap().to_string()
@@ -342,6 +434,9 @@ fn what_cannot_be_shown_is_refused_in_words() {
     refuses(&edit("/multiscales/0/datasets", swapped), "fine to coarse");
     let scale = "/multiscales/0/datasets/0/coordinateTransformations/0/scale";
     refuses(&edit(scale, json!([1.0, 0.0, 1.0])), "no size");
+    for wrong in [json!([1.0, 1.0]), json!([1.0, 1.0, 1.0, 1.0]), json!(2.0)] {
+        refuses(&edit(scale, wrong), "a scale has no number for each axis");
+    }
 
     drop(fs::remove_dir_all(&folder));
     let nothing = refusal(&root.path().join("nothing"));
@@ -376,6 +471,18 @@ fn other_types_and_absurd_shapes_are_refused() {
             "an axis can have",
         ),
         ("shape", "[9,41,83]", "[9,-41,83]", "no shape"),
+        (
+            "key",
+            "\"node_type\"",
+            "\"wrapped\":{\"name\":\"x\"},\"node_type\"",
+            "it has \"wrapped\", which is not known",
+        ),
+        (
+            "key",
+            "\"node_type\"",
+            "\"plain\":false,\"node_type\"",
+            "it has \"plain\", which is not known",
+        ),
     ] {
         let folder = root.path().join(format!("{words}.zarr"));
         write_image(&folder, "zyx", "uint8", Version::V3);
@@ -386,6 +493,21 @@ fn other_types_and_absurd_shapes_are_refused() {
         let refusal = refusal(&folder);
         assert!(refusal.contains(words), "{what}: {refusal}");
     }
+}
+
+/// What says of itself that it need not be understood, and what is said of groups.
+#[test]
+fn what_an_array_says_beside_the_matter_is_passed_over() {
+    let folder = tempfile::tempdir().unwrap();
+    write_image(folder.path(), "zyx", "uint8", Version::V3);
+    let file = folder.path().join("s0/zarr.json");
+    let mut array: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    array["remark"] = json!({"must_understand": false, "text": "hello"});
+    array["consolidated_metadata"] = Value::Null;
+    array["storage_transformers"] = json!([]);
+    array["dimension_names"] = json!(["z", "y", "x"]);
+    fs::write(&file, array.to_string()).unwrap();
+    open(folder.path()).unwrap();
 }
 
 #[test]
@@ -414,6 +536,11 @@ fn one_damaged_chunk_costs_its_own_voxels_and_names_its_array() {
     let cause = std::error::Error::source(&error).unwrap().to_string();
     assert!(cause.contains("damaged") && cause.contains("s0"), "{cause}");
     assert!(matches!(read(0, 1), Ok(Chunk::Voxels(_))));
+    // A folder in its place is not a chunk that was never stored.
+    fs::remove_file(folder.join("s0/c/0/0/1")).unwrap();
+    fs::create_dir(folder.join("s0/c/0/0/1")).unwrap();
+    let error = read(1, 0).unwrap_err();
+    assert!(!error.is_transient(), "{error:?}");
 }
 
 #[test]

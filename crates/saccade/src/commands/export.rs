@@ -1,11 +1,17 @@
 //! `saccade export`: a volume, or a part of one, as files that need no Saccade.
 
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+
 use anyhow::{Result, bail};
 use clap::Args;
 use glam::UVec3;
 use indicatif::{ProgressBar, ProgressStyle};
 use saccade_archive::StorageLocation;
+use saccade_archive::storage::Storage;
 use saccade_core::voxel_box::VoxelBox;
+use saccade_source::VolumeSource;
 use saccade_source::export::{ExportError, ExportOptions, ExportProgress, export};
 
 use crate::arguments::CatalogArgument;
@@ -13,6 +19,9 @@ use crate::interrupt::interrupted;
 use crate::open::Place;
 use crate::report::say;
 use crate::stitching::Stitching;
+
+/// Status with which an export ends that was told to end before it was whole, as of a program that a signal ends.
+const INTERRUPTED: u8 = 130;
 
 /// A list of channels, in one argument.
 #[derive(Clone)]
@@ -39,7 +48,7 @@ fn region(text: &str) -> Result<VoxelBox, String> {
 }
 
 /// Write a volume, or a part of it, as an OME-Zarr 0.5 image with shards. An export that was
-/// interrupted goes on when it is begun again.
+/// interrupted goes on when it is begun again; it ends with 130.
 #[derive(Args)]
 pub(crate) struct Export {
     /// Address of a server; or a visualization archive: its folder, or s3://bucket/prefix with
@@ -86,11 +95,30 @@ pub(crate) struct Export {
 }
 
 impl Export {
-    pub(crate) async fn run(self) -> Result<()> {
+    pub(crate) async fn run(self) -> Result<ExitCode> {
         let volume = self.volume.as_deref();
         let opened = self.place.open(&self.catalog, volume, &self.stitching);
         let source = opened.await?.source;
+        let out = self.out.clone();
+        let folder = match &out {
+            StorageLocation::Folder(folder) => Some(folder.as_path()),
+            _ => None,
+        };
+        let is_new = folder.is_some_and(|folder| !folder.exists());
         let storage = self.out.open().await?;
+        let done = self.export(&source, &*storage).await;
+        drop(storage);
+        if let Some(folder) = folder {
+            leave(folder, is_new);
+        }
+        done
+    }
+
+    async fn export(
+        self,
+        source: &Arc<dyn VolumeSource>,
+        storage: &dyn Storage,
+    ) -> Result<ExitCode> {
         let options = ExportOptions {
             region: self.region,
             channels: self.channels.map(|Channels(list)| list),
@@ -115,14 +143,16 @@ impl Export {
             bar.set_position(progress.done);
             bar.set_message(megabytes(progress.bytes));
         };
-        let exporting = export(&source, &*storage, &options, &show);
+        let exporting = export(source, storage, &options, &show);
         let done = tokio::select! {
-            done = exporting => done,
+            // Listens before anything is done.
+            biased;
             () = interrupted() => {
                 bar.finish_and_clear();
                 say("interrupted; the same command goes on with the export");
-                return Ok(());
+                return Ok(ExitCode::from(INTERRUPTED));
             }
+            done = exporting => done,
         };
         bar.finish_and_clear();
         let done = match done {
@@ -136,12 +166,18 @@ impl Export {
             Err(error @ ExportError::Label { .. }) => bail!("{error} (--rename-labels)"),
             done => done?,
         };
-        if let StorageLocation::Folder(folder) = &self.out {
-            // Empty now, and no part of the image.
-            drop(std::fs::remove_dir(folder.join(".incoming")));
-        }
         say(&summary(&done, bar.elapsed().as_secs_f64()));
-        Ok(())
+        Ok(ExitCode::SUCCESS)
+    }
+}
+
+/// Takes away what is empty in a folder that was written to, or refused, and is no part of an image; and the folder itself where
+/// it `is_new` and nothing was written.
+fn leave(folder: &Path, is_new: bool) {
+    // Neither succeeds where anything is in it.
+    drop(std::fs::remove_dir(folder.join(".incoming")));
+    if is_new {
+        drop(std::fs::remove_dir(folder));
     }
 }
 

@@ -650,6 +650,24 @@ fn what_an_export_finds_in_its_place() {
     assert!(stderr(&done(["export", &archive, text(&out)])).contains("nothing to do"));
     let taken = export(&["--channels", "0", "--compression", "0"]);
     assert_failed(&taken, 1, &["something already", text(&out)]);
+    // What was taken away is exported again.
+    let shard = out.join("0/c/0/0/0/0");
+    let bytes = std::fs::read(&shard).unwrap();
+    std::fs::remove_file(&shard).unwrap();
+    let mended = stderr(&done(["export", &archive, text(&out)]));
+    assert!(mended.contains("were there already"), "{mended}");
+    assert_eq!(std::fs::read(&shard).unwrap().len(), bytes.len());
+    // Whoever is refused leaves nothing behind, whose folder it may be.
+    let others = folder.path().join("others");
+    std::fs::create_dir(&others).unwrap();
+    std::fs::write(others.join("letter.txt"), "hello").unwrap();
+    let taken = run(["export", &archive, text(&others)]);
+    assert_failed(&taken, 1, &["something already", text(&others)]);
+    let nowhere = folder.path().join("nowhere");
+    let outside = run(["export", &archive, text(&nowhere), "--finest", "99"]);
+    assert_failed(&outside, 1, &["no level 99"]);
+    assert_eq!(std::fs::read_dir(&others).unwrap().count(), 1);
+    assert!(!nowhere.exists() && !out.join(".incoming").exists());
     let cut = folder.path().join("cut.zarr");
     let told = stderr(&done([
         "export",

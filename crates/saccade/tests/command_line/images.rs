@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::{TcpListener, TcpStream};
+use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use serde_json::json;
 
@@ -15,6 +17,8 @@ use crate::{Running, run, saccade, stderr};
 struct Files {
     /// Paths and answers: a status with its headers, and a body.
     files: BTreeMap<String, (String, Vec<u8>)>,
+    /// A path whose answer never comes.
+    silent: String,
     asked: Mutex<Vec<String>>,
 }
 
@@ -22,6 +26,11 @@ impl Files {
     fn with(mut self, path: &str, body: impl Into<Vec<u8>>) -> Self {
         self.files
             .insert(path.to_owned(), ("200 OK".to_owned(), body.into()));
+        self
+    }
+
+    fn silent_at(mut self, path: &str) -> Self {
+        path.clone_into(&mut self.silent);
         self
     }
 
@@ -50,6 +59,11 @@ impl Files {
             while line != "\r\n" {
                 line.clear();
                 reader.read_line(&mut line).ok().filter(|n| *n > 0)?;
+            }
+            if path == self.silent {
+                // Until the client goes.
+                reader.read_line(&mut line).ok();
+                return None;
             }
             let missing = ("404 Not Found".to_owned(), Vec::new());
             let (status, body) = self.files.get(&path).unwrap_or(&missing);
@@ -181,6 +195,47 @@ fn a_server_fetches_from_its_image_and_from_nowhere_else() {
             path.starts_with("/data/image.zarr/"),
             "{path} is no part of the image"
         );
+    }
+}
+
+/// Whoever started it learns that there is no image yet.
+#[cfg(unix)]
+#[test]
+fn an_export_that_is_interrupted_says_so() {
+    for signal in ["-INT", "-TERM"] {
+        let mut files = image("127.0.0.1:1");
+        let silent = "/data/image.zarr/0/c/2/0/0";
+        files.files.remove(silent);
+        let (files, address) = files.silent_at(silent).start();
+        let place = format!("http://{address}/data/image.zarr");
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out.zarr");
+        let mut export = saccade();
+        export.args(["export", &place, text(&out)]);
+        let mut export = Running(export.stderr(Stdio::piped()).spawn().unwrap());
+        while !files
+            .asked
+            .lock()
+            .unwrap()
+            .iter()
+            .any(|path| path == silent)
+        {
+            assert!(export.0.try_wait().unwrap().is_none(), "it has ended");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let id = export.0.id().to_string();
+        let told = Command::new("kill").args([signal, &id]).status().unwrap();
+        assert!(told.success());
+        assert_eq!(export.0.wait().unwrap().code(), Some(130), "{signal}");
+        let mut said = String::new();
+        let mut stderr = export.0.stderr.take().unwrap();
+        stderr.read_to_string(&mut said).unwrap();
+        assert!(
+            said.contains("interrupted; the same command goes on"),
+            "{said}"
+        );
+        assert!(!out.join("zarr.json").exists() && out.join("export.json").exists());
+        assert!(!out.join(".incoming").exists());
     }
 }
 

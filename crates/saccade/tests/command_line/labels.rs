@@ -179,6 +179,53 @@ fn the_same_tiles_as_shades_have_values_that_no_object_has() {
     assert!(seen.len() > 20, "{seen:?}");
 }
 
+/// An image of labels, 16 by 8 by 4, of which one has an id that fits into no 16 bits.
+fn wide_labels(folder: &Path) -> String {
+    let image = folder.join("cells.zarr");
+    let axis = |name: &str| json!({"name": name, "type": "space", "unit": "nanometer"});
+    let scale = json!([{"type": "scale", "scale": [4, 4, 4]}]);
+    let group = json!({"zarr_format": 3, "node_type": "group", "attributes": {"ome": {
+        "version": "0.5", "image-label": {}, "multiscales": [{"axes": [axis("z"), axis("y"), axis("x")],
+            "datasets": [{"path": "0", "coordinateTransformations": scale}]}]}}});
+    let array = json!({"zarr_format": 3, "node_type": "array", "shape": [4, 8, 16], "data_type": "uint32",
+        "fill_value": 0, "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [4, 8, 16]}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]});
+    let ids = (0..512_u32).map(|n| if n == 300 { 70_000 } else { n % 7 + 1 });
+    let bytes: Vec<u8> = ids.flat_map(u32::to_le_bytes).collect();
+    fs::create_dir_all(image.join("0/c/0/0")).unwrap();
+    fs::write(image.join("zarr.json"), group.to_string()).unwrap();
+    fs::write(image.join("0/zarr.json"), array.to_string()).unwrap();
+    fs::write(image.join("0/c/0/0/0"), bytes).unwrap();
+    image.to_str().unwrap().to_owned()
+}
+
+/// By way of a server as well as from its files; and what is advised then works.
+#[test]
+fn ids_that_do_not_fit_are_not_exported_without_a_word() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = wide_labels(folder.path());
+    let (_server, url) = Running::start(saccade().args(["serve", &image, "--port", "0"]));
+    for (name, place) in [("direct", &image), ("served", &url)] {
+        let out = folder.path().join(name);
+        let export = |more: &[&str]| {
+            let out = out.to_str().unwrap();
+            run(["export", place, out].iter().chain(more))
+        };
+        let refused = export(&[]);
+        let said = stderr(&refused);
+        assert!(!refused.status.success(), "{name}: {said}");
+        assert!(
+            said.contains("ids such as 70000") && said.contains("--rename-labels"),
+            "{name}: {said}"
+        );
+        assert!(!out.join(".incoming").exists() && !out.join("zarr.json").exists());
+        let allowed = export(&["--rename-labels"]);
+        assert!(allowed.status.success(), "{name}: {}", stderr(&allowed));
+        assert!(out.join("zarr.json").exists());
+    }
+}
+
 #[test]
 fn whoever_asks_to_mix_labels_is_told_and_gets_labels() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,16 +1,20 @@
 //! The body of an answer, as far as it is the part that was asked for.
 
-use bytes::{Bytes, BytesMut};
+use std::ops::Range;
+
+use bytes::Bytes;
 use futures::StreamExt as _;
 use reqwest::{Response, StatusCode, header};
 use web_time::Instant;
 
 use super::chain;
 use crate::objects::error::Failure;
-use crate::objects::{ObjectError, Part, Patience, part_of};
+use crate::objects::{ObjectError, Part, Patience};
 
-/// Longest object that is read in whole because its server ignores ranges \[bytes\].
+/// Longest object that is read in whole because its server ignores ranges \[bytes\]. Of one, no more is kept than was asked for.
 const LONGEST_WHOLE: u64 = 256 << 20;
+/// Bytes that are kept beyond the end of an object before they are dropped together.
+const DROPPED_AT_ONCE: usize = 64 << 10;
 
 /// Reads it, and no more of it than the part.
 pub(super) async fn read(
@@ -99,29 +103,29 @@ pub(super) async fn read(
     if told.is_some_and(|told| told > most) && !cut_by_us {
         return Err(too_long());
     }
-    let mut bytes = BytesMut::new();
+    let mut kept = Kept::new(part, partial);
     let mut body = answer.bytes_stream();
     #[expect(clippy::disallowed_methods, reason = "web_time's, which browsers have")]
     let begun = Instant::now();
     while let Some(more) = patience.idle(body.next()).await? {
         let more = more.map_err(|error| Failure::again(chain(&error.without_url())))?;
-        bytes.extend_from_slice(&more);
-        if bytes.len() as u64 > most {
-            if cut_by_us {
-                break;
-            }
+        kept.add(&more);
+        if cut_by_us && kept.come >= most {
+            break;
+        }
+        if kept.come > most {
             return Err(too_long());
         }
         let seconds = begun.elapsed().saturating_sub(patience.idle).as_secs_f64();
         let least = seconds * f64::from(patience.slowest);
-        if (bytes.len() as f64) < least {
-            let count = bytes.len();
+        if (kept.come as f64) < least {
+            let count = kept.come;
             return Err(Failure::again(format!(
                 "no more than {count} bytes came in time"
             )));
         }
     }
-    let count = bytes.len() as u64;
+    let count = kept.come;
     let expected = must.or(told.filter(|_| !cut_by_us));
     if expected.is_some_and(|expected| expected != count) {
         let expected = expected.unwrap_or_default();
@@ -129,11 +133,72 @@ pub(super) async fn read(
             "{count} bytes came instead of {expected}"
         )));
     }
-    let bytes = bytes.freeze();
-    if partial {
-        Ok(bytes)
-    } else {
-        part_of(&bytes, part, || location.to_owned()).map_err(Failure::Final)
+    kept.part().map_err(|wanted| {
+        Failure::Final(ObjectError::TooShort {
+            wanted,
+            location: location.to_owned(),
+        })
+    })
+}
+
+/// Of what comes, what was asked for: where a server ignores ranges, that is a small part of it.
+struct Kept {
+    /// Those bytes of the object, if it is the object that comes.
+    wanted: Option<Range<u64>>,
+    /// So many bytes at the end, if it is the object that comes.
+    last: Option<usize>,
+    bytes: Vec<u8>,
+    /// Bytes that have come, kept or not.
+    come: u64,
+}
+
+impl Kept {
+    fn new(part: &Part, partial: bool) -> Self {
+        let (wanted, last) = match part {
+            Part::Range(wanted) if !partial => (Some(wanted.clone()), None),
+            Part::Last(count) if !partial => {
+                (None, Some(usize::try_from(*count).unwrap_or(usize::MAX)))
+            }
+            _ => (None, None),
+        };
+        Self {
+            wanted,
+            last,
+            bytes: Vec::new(),
+            come: 0,
+        }
+    }
+
+    fn add(&mut self, more: &[u8]) {
+        let length = more.len() as u64;
+        let more = match &self.wanted {
+            Some(wanted) => {
+                let at = |edge: u64| edge.saturating_sub(self.come).min(length);
+                let at = |edge| usize::try_from(at(edge)).unwrap_or(more.len());
+                &more[at(wanted.start)..at(wanted.end)]
+            }
+            None => more,
+        };
+        self.bytes.extend_from_slice(more);
+        self.come += length;
+        if let Some(last) = self.last {
+            let needless = self.bytes.len().saturating_sub(last);
+            if needless > last.max(DROPPED_AT_ONCE) {
+                self.bytes.drain(..needless);
+            }
+        }
+    }
+
+    /// The part, or what it should have been where less came.
+    fn part(mut self) -> Result<Bytes, Range<u64>> {
+        if let Some(wanted) = self.wanted.filter(|wanted| wanted.end > self.come) {
+            return Err(wanted);
+        }
+        if let Some(last) = self.last {
+            let needless = self.bytes.len().saturating_sub(last);
+            self.bytes.drain(..needless);
+        }
+        Ok(self.bytes.into())
     }
 }
 
@@ -163,7 +228,56 @@ fn ignores_ranges(location: &str) {
 
 #[cfg(test)]
 mod tests {
-    use super::parse_range;
+    use super::*;
+
+    /// However much comes, and however it is cut.
+    #[test]
+    fn of_a_whole_object_no_more_is_kept_than_was_asked_for() {
+        let object: Vec<u8> = (0..1_000_000_u32).flat_map(u32::to_le_bytes).collect();
+        let length = object.len() as u64;
+        let parts = [
+            Part::Last(1000),
+            Part::Last(1),
+            Part::Range(0..1000),
+            Part::Range(length / 2 + 3..length / 2 + 2003),
+            Part::Range(length - 5..length),
+        ];
+        for (part, piece) in parts.iter().flat_map(|part| [(part, 7000), (part, 999)]) {
+            let mut kept = Kept::new(part, false);
+            let mut most = 0;
+            for more in object.chunks(piece) {
+                kept.add(more);
+                most = most.max(kept.bytes.capacity());
+            }
+            assert!(most < 300_000, "{part:?}: {most} bytes were held");
+            let bounds = match part {
+                Part::Range(range) => range.clone(),
+                Part::Last(count) => length - count..length,
+                Part::Whole { .. } => 0..length,
+            };
+            let at = |edge: u64| usize::try_from(edge).unwrap();
+            let got = kept.part().unwrap();
+            assert!(
+                got == object[at(bounds.start)..at(bounds.end)],
+                "{part:?} in pieces of {piece}"
+            );
+        }
+        // What is a part by itself, or wanted as a whole, is kept as it comes.
+        for (part, partial) in [
+            (Part::Whole { most: length }, false),
+            (Part::Range(4..9), true),
+            (Part::Last(9), true),
+        ] {
+            let mut kept = Kept::new(&part, partial);
+            kept.add(&object);
+            assert!(kept.part().unwrap() == object, "{part:?}");
+        }
+        for (part, short) in [(Part::Range(2..8), true), (Part::Last(8), false)] {
+            let mut kept = Kept::new(&part, false);
+            kept.add(&object[..7]);
+            assert_eq!(kept.part().is_err(), short, "{part:?}");
+        }
+    }
 
     #[test]
     fn ranges_are_read_or_nothing() {
