@@ -44,13 +44,10 @@ impl Stamps {
             return;
         };
         let mut file = BufReader::new(file);
-        let mut entry = [0; ENTRY];
-        while file.read_exact(&mut entry).is_ok() {
-            let bits = u128::from_le_bytes(entry);
-            take(
-                (bits >> 64) as u64,
-                Seen::from_bits((bits & u128::from(u64::MAX)) as u64),
-            );
+        let mut entry = [[0; ENTRY / 2]; 2];
+        while file.read_exact(entry.as_flattened_mut()).is_ok() {
+            let [seen, key] = entry.map(u64::from_le_bytes);
+            take(key, Seen::from_bits(seen));
         }
     }
 
@@ -59,10 +56,8 @@ impl Stamps {
         if entries.is_empty() {
             return;
         }
-        let entry = |(key, seen): &(u64, Seen)| {
-            (u128::from(*key) << 64 | u128::from(seen.to_bits())).to_le_bytes()
-        };
-        let bytes: Vec<u8> = entries.iter().flat_map(entry).collect();
+        let entry = |(key, seen): &(u64, Seen)| [seen.to_bits(), *key].map(u64::to_le_bytes);
+        let bytes: Vec<u8> = entries.iter().flat_map(entry).flatten().collect();
         match self.append(&bytes) {
             Ok(()) => self.warned = false,
             Err(e) if !self.warned => {

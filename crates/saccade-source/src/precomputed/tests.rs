@@ -138,8 +138,8 @@ async fn levels_lie_where_their_offsets_say() {
         let volume = source.volume().clone();
         assert_eq!(volume.origin_nm.to_array(), [56.0, -160.0, 120.0]);
         // 3 and 8 voxels of 16 nm are half a one less than 3.5 and, rounded, 9 from where the whole is.
-        let shift = glam::DVec3::new(-8.0, 0.0, 0.0);
-        assert_eq!(volume.shifts_nm, [glam::DVec3::ZERO, shift]);
+        let shift = DVec3::new(-8.0, 0.0, 0.0);
+        assert_eq!(volume.shifts_nm, [DVec3::ZERO, shift]);
         let oracle = |id: ChunkId, off: glam::IVec3| {
             let size = if id.level == 0 { SIZE } else { coarse };
             let begin = if id.level == 0 {
