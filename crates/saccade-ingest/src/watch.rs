@@ -17,7 +17,7 @@
 //! changed, a file itself is looked at, each second, with half of the budget at most: one that was filled meanwhile
 //! is told of again. Files that go away are not deletions: disks are cleared.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -279,6 +279,8 @@ impl<F: Folders> Watch<F> {
         if let Ok(told) = told.and_then(|meta| meta.modified()) {
             let mut reader = RecordReader::new(&self.kept, Cursor::default());
             self.scanner.told_until(told);
+            // Tellings of a file of which it is not known what it looked like.
+            let mut unknown: HashMap<u64, u32> = HashMap::new();
             loop {
                 let lines = reader.read(4096)?;
                 if lines.is_empty() {
@@ -286,12 +288,22 @@ impl<F: Folders> Watch<F> {
                 }
                 for line in lines {
                     if let Ok(Record::Tile(tile)) = line.record {
-                        self.scanner.remember(file_name(&tile.file));
+                        let key = self.scanner.told_key(file_name(&tile.file));
+                        *unknown.entry(key).or_default() += 1;
                     }
                 }
             }
             let scanner = &mut self.scanner;
-            self.stamps.each(|key, seen| scanner.remember_as(key, seen));
+            self.stamps.each(|key, seen| {
+                scanner.remember_as(key, seen);
+                if let Some(tellings) = unknown.get_mut(&key) {
+                    *tellings = tellings.saturating_sub(1);
+                }
+            });
+            // A process that died told of a file and kept no more: what it looked like before says nothing.
+            for (key, _) in unknown.into_iter().filter(|(_, tellings)| *tellings > 0) {
+                scanner.remember_nothing_of(key);
+            }
         }
         self.list = Some(list);
         Ok(true)

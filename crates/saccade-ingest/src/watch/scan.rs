@@ -240,7 +240,21 @@ impl<F: Folders> Scanner<F> {
 
     /// Says that a file was told of by an earlier process, no later than [`Self::told_until`] says.
     pub fn remember(&mut self, file: &str) {
-        self.told.insert(self.hasher.hash_one(file), None);
+        self.told_key(file);
+    }
+
+    /// The same; by which it is remembered.
+    pub(super) fn told_key(&mut self, file: &str) -> u64 {
+        let key = self.hasher.hash_one(file);
+        self.told.insert(key, None);
+        key
+    }
+
+    /// Says that it is not known what a file looked like when an earlier process told of it last.
+    pub(super) fn remember_nothing_of(&mut self, key: u64) {
+        if let Some(told) = self.told.get_mut(&key) {
+            *told = None;
+        }
     }
 
     /// Says what a file looked like when an earlier process told of it.
