@@ -289,12 +289,12 @@ class Real(Case):
             options = ["--region", "0,0,0," + ",".join(map(str, end))] if end else []
             with self.subTest(name):
                 self.same(folder / name, *levels, options=options)
-                # Where the whole lies is kept; the middle of a voxel is half of it further than its corner.
+                # Where each level lies is kept; the middle of a voxel is half of it further than its corner.
                 resolution = np.array(scales[0]["resolution"])
                 for scale, transforms in zip(scales, self.transforms):
                     moved = dict((one["type"], one) for one in transforms).get("translation", {}).get("translation", [0] * 4)
-                    corner = np.array(scales[0].get("voxel_offset", [0] * 3)) * resolution
-                    want = corner + (np.array(scale["resolution"]) - resolution) / 2
+                    own = np.array(scale["resolution"])
+                    want = np.array(scale.get("voxel_offset", [0] * 3)) * own + (own - resolution) / 2
                     np.testing.assert_allclose(moved[:0:-1], want, err_msg=f"{name}, {scale['key']}")
                 self.assertEqual(self.renamed, labels)
 

@@ -193,7 +193,6 @@ class S3(unittest.TestCase):
             ({}, [f"s3://{BUCKET}/x"], {}, "--catalog"),
             ({}, ["s3://nobody/x", "--catalog", here], {}, "no such bucket"),
             ({"denied": 1}, [f"s3://{BUCKET}/x", "--catalog", here], {}, "AWS_SECRET_ACCESS_KEY"),
-            ({}, [f"s3://{BUCKET}/x", "--catalog", here], {"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "network"),
             ({}, [f"s3://{BUCKET}/x", "--catalog", here], {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}, "no credentials"),
             ({}, ["s3:/x", "--catalog", here], {}, "s3://bucket"),
             ({}, ["gs://x/y", "--catalog", here], {}, "s3://bucket"),
@@ -204,6 +203,20 @@ class S3(unittest.TestCase):
             self.assertIn(said, done.stderr)
             self.assertNotIn("panicked", done.stderr)
             self.assertFalse(here.exists(), "a catalog was left behind")
+
+    def test_a_store_that_is_away_at_the_start_is_waited_for(self):
+        here = self.work / "away.sqlite"
+        # Nobody listens there.
+        env = {**os.environ, "AWS_ENDPOINT_URL": "http://127.0.0.1:9"}
+        run = [BIN, "ingest", self.acquisition, f"s3://{BUCKET}/x", "--catalog", here, "--once"]
+        with subprocess.Popen([*map(str, run)], stderr=subprocess.PIPE, text=True, env=env) as waits:
+            told = waits.stderr.readline()
+            self.assertIn("network", told)
+            self.assertIn("trying again", told)
+            self.assertIsNone(waits.poll())
+            waits.terminate()
+            self.assertNotIn("panicked", waits.stderr.read())
+        self.assertFalse(here.exists(), "a catalog was left behind")
 
 
 def chunks(url):

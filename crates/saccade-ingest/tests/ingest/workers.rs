@@ -121,7 +121,16 @@ async fn a_server_that_is_away_is_waited_for() {
                 tokio::time::sleep(Duration::from_millis(1)).await;
             }
             tiles = diary.states().last().unwrap().tiles;
+            let before = diary.notices().len();
             tokio::task::block_in_place(|| server.kill());
+            // Until it is missed: a busy machine may be long at the tile in hand.
+            let missed = async {
+                while diary.notices().len() == before {
+                    tokio::time::sleep(Duration::from_millis(5)).await;
+                }
+            };
+            let missed = tokio::time::timeout(Duration::from_secs(20), missed).await;
+            missed.expect("nobody misses the server");
             tokio::time::sleep(Duration::from_millis(400)).await;
             tokio::task::block_in_place(|| server.run());
         }
