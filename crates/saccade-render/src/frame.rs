@@ -27,6 +27,8 @@ const MOST_BIAS: f32 = 32.0;
 const FAR_VOXELS: f32 = 262_144.0;
 /// Thickness of a slab that is to have none, of the finest voxel's shortest edge: one sample.
 const THIN: f64 = 1e-3;
+/// The same of its distance from the eye: a few of the steps that f32 has there, so that its faces stay apart.
+const THIN_FROM_AFAR: f64 = 1.0 / 1_048_576.0;
 
 /// A channel that is seen, and what it is stored as.
 #[derive(Clone, Copy, Debug)]
@@ -251,7 +253,7 @@ pub(crate) fn mode_of(mode: Mode) -> u32 {
 /// finite.
 fn planes(clip: &Clip, eye_nm: DVec3, thin_nm: f64) -> Option<[Vec4; MOST_PLANES]> {
     let mut planes = [Vec4::W; MOST_PLANES];
-    let slab = clip.slab.map(|slab| faces(slab, thin_nm));
+    let slab = clip.slab.map(|slab| faces(slab, eye_nm, thin_nm));
     let faces = slab.into_iter().flatten();
     let half_spaces = clip.half_spaces.into_iter().flatten().chain(faces);
     for (plane, HalfSpace { point, normal }) in planes.iter_mut().zip(half_spaces) {
@@ -270,8 +272,10 @@ fn planes(clip: &Clip, eye_nm: DVec3, thin_nm: f64) -> Option<[Vec4; MOST_PLANES
     Some(planes)
 }
 
-fn faces(slab: Slab, thin_nm: f64) -> [HalfSpace; 2] {
+fn faces(slab: Slab, eye_nm: DVec3, thin_nm: f64) -> [HalfSpace; 2] {
     let normal = slab.normal.normalize_or_zero();
+    let distance = normal.dot(eye_nm - slab.point.xyz).abs();
+    let thin_nm = thin_nm.max(distance * THIN_FROM_AFAR);
     let half = slab.thickness_nm.max(thin_nm) / 2.0;
     [normal, -normal].map(|normal| HalfSpace {
         point: Point::new(slab.point.xyz - normal * half),
@@ -358,6 +362,30 @@ mod tests {
             ..Clip::default()
         };
         assert!(super::planes(&clip, DVec3::ZERO, 0.01).is_some_and(|p| p == [Vec4::W; 6]));
+    }
+
+    /// As far away as a petascale volume is seen from, the two faces are not one number.
+    #[test]
+    fn the_faces_of_a_slab_without_thickness_stay_apart() {
+        for distance in [0.0, 3.0, 1e5, 3e7, 1e12] {
+            let slab = Slab {
+                point: Point::new(DVec3::splat(7.0)),
+                normal: DVec3::new(0.3, 0.1, 1.0),
+                thickness_nm: 0.0,
+            };
+            let clip = Clip {
+                slab: Some(slab),
+                ..Clip::default()
+            };
+            let eye = DVec3::new(7.0, 7.0, 7.0 - distance);
+            let planes = planes(&clip, eye, 0.004).unwrap();
+            let [near, far] = [planes[0].w, planes[1].w].map(f32::abs);
+            let steps = near.to_bits().abs_diff(far.to_bits());
+            let apart = distance == 0.0 || steps >= 8;
+            assert!(apart, "{distance} nm away: {near} and {far}");
+            let thickness = f64::from(far) - f64::from(near);
+            assert!(thickness <= (distance * 2e-6).max(0.005), "{thickness} nm");
+        }
     }
 
     #[test]

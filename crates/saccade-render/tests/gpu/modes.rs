@@ -4,12 +4,15 @@ use std::collections::HashSet;
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2, UVec3};
+use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
 use saccade_core::camera::Camera;
 use saccade_core::space::Point;
 use saccade_core::transfer::ColorMap;
 use saccade_core::volume::{Polarity, Volume, VoxelKind};
+use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
-    Clip, Gpu, HalfSpace, Heat, Image, Mode, Renderer, RendererOptions, Slab, Traversal, View, Work,
+    BrickVoxels, Clip, Gpu, HalfSpace, Heat, Image, Mode, Renderer, RendererOptions, Slab,
+    Traversal, View, Work,
 };
 
 use crate::harness::{frame, gpu, keep, psnr, read, settle};
@@ -286,6 +289,108 @@ fn a_slice_has_one_sample_a_ray() {
         let db = psnr(&got, &oracle::render(&scene, &thin, Cut::HalfVoxels));
         assert!(db >= 38.0, "{name}: {db:.1} dB");
     }
+}
+
+/// Seen as a whole, a large volume is so far away that f32 has but few depths there.
+#[test]
+fn slices_of_large_volumes_are_seen() {
+    let Some(gpu) = gpu() else { return };
+    let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 1.0)], 100.0);
+    for (extent, voxel_nm) in [
+        // 86 um wide.
+        (
+            UVec3::new(21_500, 21_500, 2_150),
+            DVec3::new(4.0, 4.0, 40.0),
+        ),
+        (
+            UVec3::new(2_000_000, 2_000_000, 250_000),
+            DVec3::new(5.0, 5.0, 40.0),
+        ),
+    ] {
+        let volume = Arc::new(Volume::new("v", extent, voxel_nm).unwrap());
+        let size = volume.size_nm();
+        let value = |nm: DVec3| {
+            let share = (nm / size).clamp(DVec3::ZERO, DVec3::ONE);
+            30.0 + 100.0 * share.x + 100.0 * share.z
+        };
+        let options = RendererOptions {
+            memory_bytes: 64 << 20,
+            ..RendererOptions::default()
+        };
+        let mut renderer = Renderer::new(&gpu, volume.clone(), options).unwrap();
+        renderer.set_transfer_function(&transfer);
+        for (normal, at) in [
+            (DVec3::Z, 0.3),
+            (DVec3::Z, 0.8),
+            (DVec3::X, 0.5),
+            (DVec3::new(0.4, 0.2, 1.0), 0.5),
+        ] {
+            let point = size * at;
+            let view = View {
+                mode: Mode::Maximum,
+                clip: Clip {
+                    slab: Some(Slab {
+                        point: Point::new(point),
+                        normal,
+                        thickness_nm: 0.0,
+                    }),
+                    ..Clip::default()
+                },
+                ..View::new(Camera::around(&volume), SIZE)
+            };
+            let mut report = frame(&mut renderer, &view);
+            for _ in 0..40 {
+                for id in &report.misses {
+                    let voxels = brick_of(&volume, *id, value);
+                    let voxels = BrickVoxels::Voxels(&voxels);
+                    renderer.deliver(*id, voxels).unwrap();
+                }
+                if report.is_complete() {
+                    break;
+                }
+                report = frame(&mut renderer, &view);
+            }
+            let case = format!("{extent}, {normal} at {at}");
+            let statistics = report.statistics;
+            assert!(report.is_complete(), "{case}");
+            assert!(
+                statistics.rays > SIZE.element_product() / 16,
+                "{case}: {statistics:?}"
+            );
+            assert!(
+                statistics.samples > 0,
+                "no ray took a sample, {case}: {statistics:?}"
+            );
+            // Where the plane is inside of the volume and not near its end, the picture says what is there.
+            let picture = read(&renderer);
+            let eye = view.camera.eye().xyz;
+            let mut told = 0;
+            for (index, pixel) in (0..).zip(picture.rgba.chunks_exact(4)) {
+                let pixel_at = UVec2::new(index % SIZE.x, index / SIZE.x).as_dvec2() + 0.5;
+                let ray = view.camera.ray(pixel_at, SIZE.as_dvec2());
+                let depth = normal.dot(point - eye) / normal.dot(ray);
+                let nm = eye + ray * depth;
+                let margin = size * 0.1;
+                if nm.cmplt(margin).any() || nm.cmpgt(size - margin).any() {
+                    continue;
+                }
+                let want = value(nm);
+                let got = f64::from(pixel[0]);
+                assert!((got - want).abs() < 6.0, "{case}: {got} instead of {want}");
+                told += 1;
+            }
+            assert!(told > 40, "{case}: {told} pixels were looked at");
+        }
+    }
+}
+
+/// A brick's voxels with their border, of values by place.
+fn brick_of(volume: &Volume, id: BrickId, value: impl Fn(DVec3) -> f64) -> Vec<u8> {
+    let down = volume.levels[id.level() as usize].downsampling * volume.voxel_nm;
+    let low = (id.brick() * BRICK_EDGE).as_dvec3() - f64::from(BRICK_BORDER);
+    let cells = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE)).iter();
+    let voxels = cells.map(|cell| value((low + cell.as_dvec3() + 0.5) * down) as u8);
+    voxels.collect()
 }
 
 #[test]
