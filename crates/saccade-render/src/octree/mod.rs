@@ -318,6 +318,14 @@ impl ResidencyOctree {
         self.events.is_empty()
     }
 
+    /// Bricks that are noted as resident, in order.
+    #[cfg(test)]
+    pub(crate) fn noted(&self) -> Vec<BrickId> {
+        let mut noted: Vec<_> = self.resident.iter().copied().collect();
+        noted.sort_unstable();
+        noted
+    }
+
     /// Whether no values are in the tree that changes have made wrong.
     pub(crate) fn values_hold(&self) -> bool {
         self.changes == 0
