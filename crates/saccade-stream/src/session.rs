@@ -161,6 +161,8 @@ pub struct Session {
     /// As the renderer has them.
     views: Vec<ChannelView>,
     frames_in_flight: usize,
+    /// Ceiling for GPU memory, as the user set it \[bytes\].
+    gpu_bytes: u64,
     retry: Retry,
     /// Bricks whose bounds the renderer was told since they last changed.
     told: HashSet<BrickId>,
@@ -251,6 +253,7 @@ impl Session {
             channels,
             views: Vec::new(),
             frames_in_flight: options.frames_in_flight.max(1),
+            gpu_bytes: options.gpu_bytes,
             told: HashSet::new(),
             ranges: HashMap::new(),
             searched: (HashSet::new(), Vec::new()),
@@ -280,8 +283,7 @@ impl Session {
     ///
     /// [`SessionError`] when the volume does not suit this device; the session stays as it was.
     pub fn set_gpu(&mut self, gpu: &Gpu) -> Result<(), SessionError> {
-        let ceiling = self.renderer.memory().ceiling;
-        self.renderer = renderer(gpu, self.renderer.volume(), ceiling)?;
+        self.renderer = renderer(gpu, self.renderer.volume(), self.gpu_bytes)?;
         self.pull.restart();
         self.told.clear();
         self.pending.clear();

@@ -602,6 +602,7 @@ async fn a_lost_device_is_replaced_and_the_picture_returns() {
     let before = picture(&mut session, &view).await;
     let channels = session.channels().to_vec();
     let reads = source.reads();
+    let memory = session.renderer().memory();
     gpu.device().destroy();
     let turned = View {
         camera: view.camera.orbited(5.0, 0.0),
@@ -619,6 +620,13 @@ async fn a_lost_device_is_replaced_and_the_picture_returns() {
     session.set_gpu(&other).unwrap();
     assert!(!session.frame(&view).lost);
     assert_eq!(session.renderer().memory().bricks_resident, 0, "made again");
+    // However often: nothing is taken off what was allowed.
+    for _ in 0..3 {
+        session.set_gpu(&other).unwrap();
+        let now = session.renderer().memory();
+        assert_eq!(now.ceiling, memory.ceiling);
+        assert_eq!(now.brick_slots, memory.brick_slots);
+    }
     let after = picture(&mut session, &view).await;
     assert_eq!(after, before);
     assert_eq!(session.channels(), channels, "channels are kept");
