@@ -156,7 +156,7 @@ pub struct Session {
     clock: Clock,
     refresh: Refresh,
     channels: Vec<Channel>,
-    /// How much detail each has.
+    /// How much detail each has, as far as bricks that arrived tell.
     contents: Vec<Content>,
     /// As the renderer has them.
     views: Vec<ChannelView>,
@@ -369,9 +369,12 @@ impl Session {
     /// [`ChannelError::NoSuchChannel`].
     pub fn set_detail(&mut self, channel: u32, detail: Detail) -> Result<(), ChannelError> {
         let of = self.channel_mut(channel)?;
-        // Asked for anew, it is looked for anew.
+        let by_content = detail == Detail::ByContent;
         (of.detail, of.finest_needed) = (detail, 0);
-        self.contents[channel as usize] = Content::default();
+        if by_content {
+            let needed = self.contents[channel as usize].finest_needed();
+            self.channel_mut(channel)?.finest_needed = needed;
+        }
         self.put_channels()?;
         self.is_awaited();
         Ok(())
@@ -620,12 +623,14 @@ impl Session {
         let mut judged = Vec::new();
         let sink = |id: BrickId, voxels: BrickVoxels<'_>, freshness| {
             let channel = id.channel() as usize;
+            // Whatever the detail is now: who chooses it by content later has no bricks that arrive then.
             if let BrickVoxels::Voxels(voxels) = voxels
-                && channels[channel].detail == Detail::ByContent
                 && contents[channel].wants(id.level())
             {
                 contents[channel].note(renderer.volume(), id.level(), voxels);
-                judged.push(channel);
+                if channels[channel].detail == Detail::ByContent {
+                    judged.push(channel);
+                }
             }
             let delivered = match freshness {
                 Freshness::Current => renderer.deliver(id, voxels),

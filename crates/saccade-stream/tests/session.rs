@@ -592,6 +592,28 @@ async fn a_channel_is_drawn_as_finely_as_its_values_need() {
     }
 }
 
+/// Nothing arrives any more when somebody chooses: what has arrived tells.
+#[tokio::test(flavor = "multi_thread")]
+async fn detail_by_content_may_be_chosen_when_all_is_there() {
+    let Some(gpu) = test_gpu().await else { return };
+    for (wavelength, finest) in [(40.0, 1), (4.0, 0)] {
+        let source = waves(wavelength);
+        let view = View {
+            lod_bias: -20.0,
+            ..view(source.as_ref())
+        };
+        let mut session = Session::new(&gpu, source, options()).unwrap();
+        let _ = picture(&mut session, &view).await;
+        let case = format!("waves of {wavelength} voxels");
+        assert_eq!(session.frame(&view).fidelity.level, Some(0), "{case}");
+        assert_eq!(session.channels()[0].finest_needed, 0, "not asked for");
+        session.set_detail(0, Detail::ByContent).unwrap();
+        assert_eq!(session.channels()[0].finest_needed, finest, "{case}");
+        let _ = picture(&mut session, &view).await;
+        assert_eq!(session.frame(&view).fidelity.level, Some(finest), "{case}");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_lost_device_is_replaced_and_the_picture_returns() {
     let Some(gpu) = test_gpu().await else { return };
