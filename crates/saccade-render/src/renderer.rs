@@ -177,8 +177,16 @@ impl Renderer {
             gpu: gpu.clone(),
             options: RendererOptions { bands, ..options },
             memory: VirtualMemory::new(tables, plan.blocks, plan.bricks()),
-            octree: octree
-                .map(|geometry| ResidencyOctree::new(geometry, octree_slots, plan.node_blocks)),
+            octree: octree.map(|geometry| {
+                let octree = ResidencyOctree::new(geometry, octree_slots, plan.node_blocks);
+                // Bins follow how many bits values have.
+                let stays = channels <= octree_slots && volume.dtype != Dtype::Uint16;
+                if stays {
+                    octree.of_the_same_channels()
+                } else {
+                    octree
+                }
+            }),
             pressure: Pressure::default(),
             polarity: vec![Polarity::default(); volume.channels.len()],
             channels: Vec::new(),
@@ -251,7 +259,7 @@ impl Renderer {
                 let mut resident: Vec<_> = self.memory.resident(channel).collect();
                 resident.sort_unstable();
                 for id in resident {
-                    octree.insert(id, None);
+                    octree.insert_again(id);
                 }
             }
         }

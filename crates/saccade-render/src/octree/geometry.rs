@@ -199,6 +199,17 @@ impl Geometry {
         reached.collect()
     }
 
+    /// Whether any of a brick's voxels, its border's included, is made of level-0 voxels that changed.
+    pub(crate) fn is_reached(&self, id: BrickId, changed: VoxelBox) -> bool {
+        let depths = &self.levels[id.level() as usize];
+        let level = Level {
+            extent: depths.extent,
+            downsampling: depths.downsampling,
+        };
+        let touched = level.box_from_voxels(changed).grown(BRICK_BORDER);
+        id.voxels(&level).intersects(touched)
+    }
+
     /// Levels whose residency is noted at a depth, as bits.
     pub(crate) fn residency_at(&self, depth: u32) -> u32 {
         self.residency_at[depth as usize]

@@ -12,25 +12,23 @@
 
 mod geometry;
 mod nodes;
+mod painting;
 #[cfg(test)]
 mod tests;
 mod values;
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 
 use glam::UVec3;
 use saccade_core::brick::BrickId;
 use saccade_core::voxel_box::VoxelBox;
 
 pub(crate) use geometry::{Geometry, default_cell};
-use nodes::{Known, Nodes, Own, ROOT};
+use nodes::{Nodes, Own, ROOT};
 pub(crate) use values::{Bins, BrickValues, Values};
 
 use crate::layout::SIBLINGS;
 use crate::stored_brick::StoredVoxels;
-
-/// Blocks looked at for one to forget that take about as long as a visit.
-const SEARCHED_PER_VISIT: u64 = 64;
 
 /// Blocks that wait for [`ResidencyOctree::flush`] at most, give or take one event.
 const MOST_DIRTY: usize = 4096;
@@ -67,6 +65,11 @@ pub(crate) struct ResidencyOctree {
     resident: HashSet<BrickId>,
     /// Resident bricks that found no room in the tree.
     unrecorded: HashSet<BrickId>,
+    /// Values of the bricks that were inserted, with their bins, for when their channel has a slot again or other
+    /// bins; about a fiftieth of the bricks themselves.
+    kept: HashMap<BrickId, (Bins, BrickValues)>,
+    /// Whether that may happen.
+    keeps: bool,
     visited: u64,
 }
 
@@ -77,24 +80,6 @@ struct Slot {
     bins: Bins,
     /// Events that still have to reach all nodes before what they say of the channel holds.
     assignments: u32,
-}
-
-/// A brick on its way into the tree.
-struct Painting {
-    slot: u32,
-    level: u32,
-    /// Depth at which the brick counts as resident, if it is.
-    residency: Option<u32>,
-    /// Depth at which its values are noted.
-    values: u32,
-    /// Nodes it overlaps at `deepest`: first and last.
-    deepest: u32,
-    first: UVec3,
-    last: UVec3,
-    /// Of the nodes from first to last, x fastest, what is known; `None` where the brick is but a
-    /// part of the node.
-    regions: Vec<Option<Values>>,
-    whole: Values,
 }
 
 impl ResidencyOctree {
@@ -109,7 +94,17 @@ impl ResidencyOctree {
             changes: 0,
             resident: HashSet::new(),
             unrecorded: HashSet::new(),
+            kept: HashMap::new(),
+            keeps: true,
             visited: 0,
+        }
+    }
+
+    /// The same for channels that all have a slot for good, and bins that stay.
+    pub(crate) fn of_the_same_channels(self) -> Self {
+        Self {
+            keeps: false,
+            ..self
         }
     }
 
@@ -147,8 +142,8 @@ impl ResidencyOctree {
     }
 
     /// Lets nodes know of these channels, each with its bins, from now on. Returns those that had no slot
-    /// or other bins: nothing is known of them, and what is resident is to be [inserted](Self::insert)
-    /// again. Channels that are not named lose their slot only where another needs it.
+    /// or other bins: nothing is known of them, and what is resident is to be inserted
+    /// [again](Self::insert_again). Channels that are not named lose their slot only where another needs it.
     ///
     /// There are at most as many as slots.
     pub(crate) fn assign(&mut self, channels: &[(u32, Bins)]) -> Vec<u32> {
@@ -202,6 +197,24 @@ impl ResidencyOctree {
 
     /// A brick has become resident. Without values, what is known of it stays as it is.
     pub(crate) fn insert(&mut self, id: BrickId, values: Option<BrickValues>) {
+        match (&values, self.bins_of(id.channel())) {
+            (Some(values), Some(bins)) if self.keeps => {
+                self.kept.insert(id, (bins, values.clone()))
+            }
+            _ => self.kept.remove(&id),
+        };
+        self.insert_with(id, values);
+    }
+
+    /// A brick is resident whose channel has a slot, or other bins, from now on. Its values are those that it was
+    /// inserted with.
+    pub(crate) fn insert_again(&mut self, id: BrickId) {
+        let kept = self.kept.get(&id).zip(self.bins_of(id.channel()));
+        let values = kept.map(|((from, values), to)| values.rebinned(*from, to));
+        self.insert_with(id, values);
+    }
+
+    fn insert_with(&mut self, id: BrickId, values: Option<BrickValues>) {
         self.events.push_back(Event::Brick {
             id,
             values,
@@ -218,14 +231,17 @@ impl ResidencyOctree {
         });
     }
 
-    /// A brick has left the cache. Its values stay known.
+    /// A brick has left the cache. Its values stay known while its channel has its slot.
     pub(crate) fn remove(&mut self, id: BrickId) {
+        self.kept.remove(&id);
         self.events.push_back(Event::Evicted(id));
     }
 
     /// Level-0 voxels changed: what was known of them is forgotten.
     pub(crate) fn invalidate(&mut self, voxels: VoxelBox) {
         self.changes += 1;
+        let geometry = &self.geometry;
+        self.kept.retain(|id, _| !geometry.is_reached(*id, voxels));
         self.events.push_back(Event::Changed {
             reached: self.geometry.reached_by(voxels),
             nodes: vec![(ROOT, 0, UVec3::ZERO)],
@@ -234,6 +250,7 @@ impl ResidencyOctree {
 
     /// Forgets all that is known of a channel. What is resident is to be inserted again.
     pub(crate) fn forget_channel(&mut self, channel: u32) {
+        self.kept.retain(|id, _| id.channel() != channel);
         if let Some(slot) = self.slot_of(channel) {
             if let Some(of) = &mut self.slots[slot as usize] {
                 of.assignments += 1;
@@ -339,265 +356,6 @@ impl ResidencyOctree {
     /// Hands out what changed since the last call: first texel, texels, and levels that are resident there.
     pub(crate) fn flush(&mut self, upload: impl FnMut(u32, &[[u32; 4]], &[u32])) {
         self.nodes.flush(upload);
-    }
-
-    fn paint(&mut self, id: BrickId, values: Option<&BrickValues>, resident: bool) {
-        let Some(slot) = self.slot_of(id.channel()) else {
-            return;
-        };
-        self.nodes.tick();
-        let [x, y, z] = self.geometry.split(id);
-        let level = self.geometry.levels[id.level() as usize];
-        let first = UVec3::new(x.first, y.first, z.first);
-        let count = [&x, &y, &z].map(|s| u32::try_from(s.gaps.len()).expect("a few nodes"));
-        let last = first + UVec3::from_array(count) - 1;
-        let mut inside = Vec::new();
-        for z in &z.inside {
-            for y in &y.inside {
-                inside.extend(x.inside.iter().map(|x| *x && *y && *z));
-            }
-        }
-        // Where all of a brick is alike, larger nodes can tell.
-        let uniform = values.is_none_or(|v| v.regions.is_none());
-        let aligned = inside.iter().all(|inside| *inside);
-        let region = |(index, inside): (usize, &bool)| {
-            let values = values?;
-            let values = values.regions.as_ref().map_or(values.whole, |v| v[index]);
-            inside.then_some(values)
-        };
-        let regions = inside.iter().enumerate().map(region).collect();
-        let painting = Painting {
-            slot,
-            level: id.level(),
-            residency: resident.then_some(level.residency),
-            values: if uniform && aligned {
-                level.residency
-            } else {
-                level.values
-            },
-            deepest: level.values,
-            first,
-            last,
-            regions,
-            whole: values.map_or(Values::NONE, |v| v.whole),
-        };
-        if resident {
-            self.resident.insert(id);
-        }
-        let recorded = self.paint_node(&painting, ROOT, 0, UVec3::ZERO);
-        if resident && !recorded {
-            self.unrecorded.insert(id);
-        } else if resident {
-            self.unrecorded.remove(&id);
-        }
-    }
-
-    /// Notes a brick in a node and below; whether its residency found room.
-    fn paint_node(&mut self, brick: &Painting, node: u32, depth: u32, at: UVec3) -> bool {
-        self.visited += 1;
-        self.nodes.touch(node);
-        if brick.residency == Some(depth) {
-            let mut known = self.nodes.known(node, brick.slot);
-            known.resident |= 1 << brick.level;
-            self.nodes.set_known(node, brick.slot, known);
-        }
-        let mut recorded = brick.residency.is_none_or(|residency| depth >= residency);
-        if depth == brick.values {
-            if let Some(values) = self.painted(brick, depth, at) {
-                self.note_values(node, brick.slot, brick.level, values);
-            }
-            self.pull_up(node, depth, brick.slot);
-            return recorded;
-        }
-        let children = self.nodes.children(node).or_else(|| {
-            let geometry = &self.geometry;
-            self.nodes.split(node, |index| {
-                let child = geometry.child(depth, at, index);
-                match geometry.node_voxels(depth + 1, child).is_empty() {
-                    true => Own::OUTSIDE,
-                    false => Own::NOTHING,
-                }
-            })
-        });
-        // A search costs as much as a visit or a few.
-        self.visited += self.nodes.take_searched().div_ceil(SEARCHED_PER_VISIT);
-        if let Some(children) = children {
-            let below =
-                self.geometry.depth(depth + 1).shift - self.geometry.depth(brick.deepest).shift;
-            let (first, last) = (brick.first >> below, brick.last >> below);
-            let mut all = true;
-            for index in 0..SIBLINGS {
-                let child = self.geometry.child(depth, at, index);
-                if child.cmpge(first).all() && child.cmple(last).all() {
-                    all &= self.paint_node(brick, children + index, depth + 1, child);
-                }
-            }
-            recorded |= all;
-            self.join_if_alike(node);
-        } else if self.painted(brick, depth, at).is_some() {
-            // No room for detail: all of the brick in one.
-            self.note_values(node, brick.slot, brick.level, brick.whole);
-        }
-        self.pull_up(node, depth, brick.slot);
-        recorded
-    }
-
-    /// Values of a brick in a node, if all of the node lies in the brick.
-    fn painted(&self, brick: &Painting, depth: u32, at: UVec3) -> Option<Values> {
-        let below = self.geometry.depth(depth).shift - self.geometry.depth(brick.deepest).shift;
-        let size = brick.last - brick.first + 1;
-        let low = (at << below).max(brick.first) - brick.first;
-        let high = (((at + 1) << below) - 1).min(brick.last) - brick.first;
-        let mut values = Values::NONE;
-        for z in low.z..=high.z {
-            for y in low.y..=high.y {
-                for x in low.x..=high.x {
-                    let region = brick.regions[((z * size.y + y) * size.x + x) as usize];
-                    values = values.or(region?);
-                }
-            }
-        }
-        // Part of the node may lie beyond the nodes that the brick overlaps.
-        let edge = self.geometry.node_edge(brick.deepest);
-        let covered = VoxelBox::new(brick.first * edge, (brick.last + 1) * edge);
-        let node = self.geometry.node_voxels(depth, at);
-        (node.intersection(covered) == node).then_some(values)
-    }
-
-    fn note_values(&mut self, node: u32, slot: u32, level: u32, values: Values) {
-        let mut own = self.nodes.own(node, slot);
-        let bit = 1 << level;
-        own.values = if own.valid & !bit == 0 {
-            values
-        } else {
-            own.values.or(values)
-        };
-        own.valid |= bit;
-        self.nodes.set_own(node, slot, own);
-    }
-
-    /// What a node says follows from what was noted at it and from what its children say.
-    fn pull_up(&mut self, node: u32, depth: u32, slot: u32) {
-        let own = self.nodes.own(node, slot);
-        let mut known = Known {
-            values: own.values,
-            valid: own.valid,
-            resident: self.nodes.known(node, slot).resident & self.geometry.residency_at(depth),
-        };
-        if let Some(children) = self.nodes.children(node) {
-            let (mut values, mut valid) = (Values::NONE, u32::MAX);
-            for child in children..children + SIBLINGS {
-                let child = self.nodes.known(child, slot);
-                values = values.or(child.values);
-                valid &= child.valid;
-                known.resident |= child.resident;
-            }
-            if valid != 0 {
-                // Children know better than what was noted at the node, for the levels they know.
-                known.values = match own.valid & !valid {
-                    0 => values,
-                    _ => values.or(own.values),
-                };
-                known.valid |= valid;
-            }
-        }
-        self.nodes.set_known(node, slot, known);
-    }
-
-    /// Children that all say the same are one node.
-    fn join_if_alike(&mut self, node: u32) {
-        let Some(children) = self.nodes.children(node) else {
-            return;
-        };
-        let children = children..children + SIBLINGS;
-        let nodes = &self.nodes;
-        if children
-            .clone()
-            .any(|child| nodes.children(child).is_some())
-        {
-            return;
-        }
-        let mut alike = Vec::new();
-        for channel in 0..nodes.channels() {
-            let known = children.clone().map(|child| nodes.known(child, channel));
-            let mut within = known.filter(|k| k.valid != u32::MAX);
-            let Some(first) = within.next() else { return };
-            if first.resident != 0 || !within.all(|other| other == first) {
-                return;
-            }
-            alike.push(first);
-        }
-        for (channel, alike) in (0..).zip(alike) {
-            let mut own = self.nodes.own(node, channel);
-            own.values = match own.valid & !alike.valid {
-                0 => alike.values,
-                _ => own.values.or(alike.values),
-            };
-            own.valid |= alike.valid;
-            self.nodes.set_own(node, channel, own);
-        }
-        self.nodes.join(node);
-    }
-
-    fn evict(&mut self, id: BrickId) {
-        let Some(slot) = self.slot_of(id.channel()) else {
-            return;
-        };
-        self.resident.remove(&id);
-        self.unrecorded.remove(&id);
-        let [x, y, z] = self.geometry.split(id);
-        let first = UVec3::new(x.first, y.first, z.first);
-        let count = [&x, &y, &z].map(|s| u32::try_from(s.gaps.len()).expect("a few nodes"));
-        let last = first + UVec3::from_array(count) - 1;
-        self.evict_node((id, slot), (first, last), ROOT, 0, UVec3::ZERO);
-    }
-
-    fn evict_node(
-        &mut self,
-        (id, slot): (BrickId, u32),
-        (first, last): (UVec3, UVec3),
-        node: u32,
-        depth: u32,
-        at: UVec3,
-    ) {
-        self.visited += 1;
-        let level = self.geometry.levels[id.level() as usize];
-        if depth == level.residency {
-            if !self.other_overlaps(id, depth, at) {
-                let mut known = self.nodes.known(node, slot);
-                known.resident &= !(1 << id.level());
-                self.nodes.set_known(node, slot, known);
-            }
-            return;
-        }
-        let Some(children) = self.nodes.children(node) else {
-            return;
-        };
-        let below = self.geometry.depth(depth + 1).shift - self.geometry.depth(level.values).shift;
-        let (from, to) = (first >> below, last >> below);
-        for index in 0..SIBLINGS {
-            let child = self.geometry.child(depth, at, index);
-            if child.cmpge(from).all() && child.cmple(to).all() {
-                self.evict_node(
-                    (id, slot),
-                    (first, last),
-                    children + index,
-                    depth + 1,
-                    child,
-                );
-            }
-        }
-        self.pull_up(node, depth, slot);
-    }
-
-    /// Whether another resident brick of the same level and channel overlaps a node.
-    fn other_overlaps(&self, id: BrickId, depth: u32, at: UVec3) -> bool {
-        let voxels = self.geometry.node_voxels(depth, at);
-        let mut bricks = self.geometry.bricks_over(id.level(), voxels);
-        bricks.any(|brick| {
-            let other = BrickId::new(id.channel(), id.level(), brick);
-            other.is_ok_and(|other| other != id && self.resident.contains(&other))
-        })
     }
 
     /// Takes levels from what nodes say, where a change reaches them.

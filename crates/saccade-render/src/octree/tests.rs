@@ -133,6 +133,8 @@ struct World {
     /// Resident bricks and what is known of bricks, when all events have been applied.
     resident: BTreeSet<BrickId>,
     known: BTreeSet<BrickId>,
+    /// Resident bricks that were inserted with values, which still hold.
+    valued: BTreeSet<BrickId>,
     /// The nodes as the device has them.
     device: Vec<([u32; 4], u32)>,
     random: u32,
@@ -165,6 +167,7 @@ impl World {
             ids,
             resident: BTreeSet::new(),
             known: BTreeSet::new(),
+            valued: BTreeSet::new(),
             device: Vec::new(),
             random: 1,
         }
@@ -185,6 +188,9 @@ impl World {
                 let values = self.values(id);
                 if values.is_some() {
                     self.known.insert(id);
+                    self.valued.insert(id);
+                } else {
+                    self.valued.remove(&id);
                 }
                 self.tree.insert(id, values);
                 self.resident.insert(id);
@@ -193,6 +199,7 @@ impl World {
                 let id = self.ids[number as usize % self.ids.len()];
                 self.tree.insert(id, None);
                 self.resident.insert(id);
+                self.valued.remove(&id);
             }
             Op::Note(number) => {
                 let id = self.ids[number as usize % self.ids.len()];
@@ -212,6 +219,7 @@ impl World {
                 if let Some(id) = id {
                     self.tree.remove(id);
                     self.resident.remove(&id);
+                    self.valued.remove(&id);
                 }
             }
             Op::Change(number) => {
@@ -221,17 +229,20 @@ impl World {
                 self.truth.change(voxels, number | 1);
                 self.tree.invalidate(voxels);
                 let levels = &self.truth.volume.levels;
-                self.known.retain(|id| {
+                let holds = |id: &BrickId| {
                     let level = &levels[id.level() as usize];
                     let stored = id.voxels(level).grown(BRICK_BORDER);
                     !stored.intersects(level.box_from_voxels(voxels))
-                });
+                };
+                self.known.retain(holds);
+                self.valued.retain(holds);
             }
             Op::Forget(number) => {
                 let channel = number % CHANNELS;
                 self.tree.forget_channel(channel);
                 self.resident.retain(|id| id.channel() != channel);
                 self.known.retain(|id| id.channel() != channel);
+                self.valued.retain(|id| id.channel() != channel);
             }
             Op::Exchange(number) => {
                 let first = number % CHANNELS;
@@ -242,8 +253,11 @@ impl World {
                 for channel in self.tree.assign(wanted) {
                     self.known.retain(|id| id.channel() != channel);
                     for &id in self.resident.iter().filter(|id| id.channel() == channel) {
-                        self.tree.insert(id, None);
+                        self.tree.insert_again(id);
                     }
+                    // What is resident is known as it was.
+                    let valued = self.valued.iter().filter(|id| id.channel() == channel);
+                    self.known.extend(valued);
                 }
                 let tree = &self.tree;
                 self.known.retain(|id| tree.slot_of(id.channel()).is_some());

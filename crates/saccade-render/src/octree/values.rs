@@ -46,6 +46,19 @@ impl Values {
         }
     }
 
+    /// The same with other bins: all that those which were set may hold.
+    fn rebinned(self, from: Bins, to: Bins) -> Self {
+        let mut bins = 0;
+        for bin in (0..32).filter(|bin| self.bins >> bin & 1 == 1) {
+            let [first, last] = from.values(bin);
+            let (low, high) = (first.max(self.min), last.min(self.max));
+            if low <= high {
+                bins |= to.between(low, high);
+            }
+        }
+        Self { bins, ..self }
+    }
+
     /// What either may be.
     pub(crate) fn or(self, other: Self) -> Self {
         Self {
@@ -122,6 +135,18 @@ impl BrickValues {
         Self {
             whole,
             regions: None,
+        }
+    }
+
+    /// The same with other bins.
+    pub(crate) fn rebinned(&self, from: Bins, to: Bins) -> Self {
+        let regions = self.regions.as_ref().map(|regions| {
+            let regions = regions.iter();
+            regions.map(|values| values.rebinned(from, to)).collect()
+        });
+        Self {
+            whole: self.whole.rebinned(from, to),
+            regions,
         }
     }
 
@@ -270,6 +295,31 @@ mod tests {
             }
             assert_eq!(next, 1 << 16);
         }
+    }
+
+    /// Whatever the bins were, those after them hold all that may have been, and with the same ones nothing is lost.
+    #[test]
+    fn other_bins_hold_the_same_values() {
+        let all = [5, 8, 12, 16].map(Bins::of_bits);
+        for (from, to) in all.into_iter().flat_map(|from| all.map(|to| (from, to))) {
+            for low in (0..=u16::MAX).step_by(977) {
+                for width in [0, 1, 9, 130, 5000] {
+                    let high = low.saturating_add(width);
+                    let apart = Values::between(low, high, from).or(Values::between(7, 7, from));
+                    let got = apart.rebinned(from, to);
+                    let least = Values::between(low, high, to).or(Values::between(7, 7, to));
+                    assert_eq!((got.min, got.max), (least.min, least.max));
+                    assert_eq!(got.bins & least.bins, least.bins, "{low} to {high}");
+                    if from == to {
+                        assert_eq!(got, apart);
+                    }
+                }
+            }
+            assert_eq!(Values::NONE.rebinned(from, to), Values::NONE);
+        }
+        // From fine to coarse it is not all of them.
+        let few = Values::between(100, 100, all[2]).or(Values::between(4000, 4000, all[2]));
+        assert_eq!(few.rebinned(all[2], all[3]).bins.count_ones(), 2);
     }
 
     #[test]

@@ -13,7 +13,7 @@ use saccade_render::{
 
 use crate::harness::{frame, gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
-use crate::scene::{Scene, ramp, stained, tissue, waves};
+use crate::scene::{Scene, ramp, specks, stained, tissue, waves};
 
 /// A picture counts as the oracle's from here on \[dB\].
 const SAME: f64 = 45.0;
@@ -240,6 +240,67 @@ fn the_octree_makes_room_for_other_channels() {
         })
     );
     assert_eq!(exchanged.channels().len(), 9, "refused sets change nothing");
+}
+
+/// Frames of one view until the octree is as it stays: the samples of the last.
+fn samples(renderer: &mut Renderer, view: &View) -> u64 {
+    let mut before = u64::MAX;
+    for _ in 0..40 {
+        let report = frame(renderer, view);
+        let samples = u64::from(report.statistics.samples);
+        if samples == before {
+            return samples;
+        }
+        before = samples;
+    }
+    panic!("there is no end to it");
+}
+
+/// What was known of resident bricks is known again when their channel is seen again, or has the bins it had.
+#[test]
+fn a_channel_that_comes_back_is_skipped_as_before() {
+    let Some(gpu) = gpu() else { return };
+    let mut scene = specks().deep(16);
+    let names = (0..17).map(|n| format!("channel {n}"));
+    scene.volume = std::sync::Arc::new(saccade_core::volume::Volume {
+        channels: names.collect(),
+        ..(*scene.volume).clone()
+    });
+    let view = view(Camera::around(&scene.volume).zoomed(2.0));
+    let own = &scene.views().remove(0);
+    let mut renderer = Renderer::new(&gpu, scene.volume.clone(), Default::default()).unwrap();
+    renderer.set_channels(std::slice::from_ref(own)).unwrap();
+    settle(&mut renderer, &view, &scene);
+    let before = samples(&mut renderer, &view);
+    let plain = RendererOptions {
+        traversal: Traversal::PageTables,
+        ..RendererOptions::default()
+    };
+    let mut without = Renderer::new(&gpu, scene.volume.clone(), plain).unwrap();
+    without.set_channels(std::slice::from_ref(own)).unwrap();
+    settle(&mut without, &view, &scene);
+    let all = samples(&mut without, &view);
+    assert!(2 * before < all, "{before} of {all}: nothing is skipped");
+
+    // Sixteen others take all there is room for.
+    let others = (1..17).map(|channel| ChannelView {
+        channel,
+        ..own.clone()
+    });
+    renderer.set_channels(&others.collect::<Vec<_>>()).unwrap();
+    frame(&mut renderer, &view);
+    renderer.set_channels(std::slice::from_ref(own)).unwrap();
+    assert_eq!(samples(&mut renderer, &view), before, "exchanged");
+
+    let wider = ChannelView {
+        significant_bits: own.significant_bits + 1,
+        ..own.clone()
+    };
+    renderer.set_channels(&[wider]).unwrap();
+    let other_bins = samples(&mut renderer, &view);
+    assert!(2 * other_bins < all, "{other_bins} of {all}");
+    renderer.set_channels(std::slice::from_ref(own)).unwrap();
+    assert_eq!(samples(&mut renderer, &view), before, "bins there and back");
 }
 
 #[test]
