@@ -39,7 +39,7 @@
 //!
 //! | status | meaning |
 //! |---|---|
-//! | 404 | no such volume, level or chunk, or nothing was acquired there: the fill value |
+//! | 404 | no such volume, level or chunk; with the header `saccade-nothing-acquired`, a chunk without voxels: the fill value |
 //! | 304, 412, 416 | what a client's own conditions ask for |
 //! | 503 with `Retry-After` | not ready, or a failure that may pass, which `cause` names |
 //! | 503 with `Retry-After`, also | more connections, requests or event streams at once than [`Limits`] allow |
@@ -64,6 +64,7 @@ mod formats;
 mod history;
 mod http;
 mod index;
+mod lingering;
 mod pieces;
 mod routes;
 mod server;

@@ -1,5 +1,6 @@
 //! The voxels of one object, as an HTTP answer.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::http::header::{
@@ -8,15 +9,17 @@ use axum::http::header::{
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
+use futures::FutureExt;
 use futures::future::try_join_all;
 use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
-use saccade_source::remote::RENAMED_LABEL;
+use saccade_source::remote::{NOTHING_ACQUIRED, RENAMED_LABEL};
 use saccade_source::{Chunk, ChunkError, ChunkId};
 
 use crate::formats::Piece;
 use crate::http::{Requested, Tag, cause, failing, not_found, requested, try_again};
+use crate::lingering::Lingers;
 use crate::server::Compressible;
 use crate::volumes::Published;
 
@@ -33,7 +36,7 @@ const KEEP: HeaderValue = HeaderValue::from_static("public, max-age=86400, immut
 ///
 /// `version` is the version of the volume that the address names, if any.
 pub(crate) async fn piece(
-    published: &Published,
+    published: &Arc<Published>,
     piece: &Piece,
     version: Option<&str>,
     headers: &HeaderMap,
@@ -47,7 +50,7 @@ pub(crate) async fn piece(
 }
 
 async fn conditional(
-    published: &Published,
+    published: &Arc<Published>,
     piece: &Piece,
     version: Option<&str>,
     headers: &HeaderMap,
@@ -58,17 +61,23 @@ async fn conditional(
     if let Some(answer) = tag.precondition(headers) {
         return answer;
     }
-    let voxels = match tokio::time::timeout(patience, read(published, piece)).await {
+    let mut reading = Box::pin(read(published.clone(), piece.clone()));
+    let voxels = match tokio::time::timeout(patience, &mut reading).await {
         Ok(Ok(Some(voxels))) => voxels,
         Ok(Ok(None)) => {
             let (level, chunk) = place;
-            return not_found(
-                format!("nothing was acquired in level {level} chunk {chunk}"),
-                Vec::new(),
-            );
+            let why = format!("nothing was acquired in level {level} chunk {chunk}");
+            let mut answer = not_found(why, Vec::new());
+            let is_so = HeaderValue::from_static("1");
+            answer.headers_mut().insert(NOTHING_ACQUIRED, is_so);
+            return answer;
         }
         Ok(Err(error)) => return failed(published, &error),
-        Err(_) => return late(published, place, patience),
+        Err(_) => {
+            let what = Lingers::Piece(piece.level, piece.chunk, piece.channels.clone());
+            published.lingering.go_on(what, reading.map(drop));
+            return late(published, place, patience);
+        }
     };
     // A change during the read leaves open which state this is: then it goes without a tag.
     let tag = Some(tag).filter(|tag| published.tag(place) == *tag);
@@ -78,7 +87,7 @@ async fn conditional(
 }
 
 /// The bytes of an object; `None` where nothing was acquired.
-async fn read(published: &Published, piece: &Piece) -> Result<Option<Bytes>, ChunkError> {
+async fn read(published: Arc<Published>, piece: Piece) -> Result<Option<Bytes>, ChunkError> {
     let volume = published.volume();
     let reads = piece.channels.clone().map(|channel| {
         published.source.read(ChunkId {

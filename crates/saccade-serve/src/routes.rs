@@ -18,7 +18,7 @@ use axum::routing::get;
 use axum::{Json, Router};
 use saccade_core::volume::Dtype;
 use saccade_source::ChunkId;
-use saccade_source::remote::RENAMED_LABEL;
+use saccade_source::remote::{NOTHING_ACQUIRED, RENAMED_LABEL};
 use tokio::sync::{Semaphore, watch};
 use tower_http::CompressionLevel;
 use tower_http::compression::CompressionLayer;
@@ -90,6 +90,7 @@ pub(crate) fn router(app: App) -> Router {
             ETAG,
             RETRY_AFTER,
             HeaderName::from_static(RENAMED_LABEL),
+            HeaderName::from_static(NOTHING_ACQUIRED),
         ])
         .max_age(Duration::from_secs(86_400));
     let marked = |_: StatusCode, _: Version, _: &HeaderMap, extensions: &Extensions| {
@@ -441,15 +442,19 @@ pub(crate) async fn ranges(
         Dtype::Uint8 => u16::from(u8::MAX),
         _ => u16::MAX,
     };
-    let found = published.source.find_value_ranges(&ids).await;
-    let ranges = found.into_iter().map(|range| match range {
-        Ok(range) => range.map(|range| [range.min, range.max]),
-        // Whoever reads the chunk learns what is wrong with it.
-        Err(_) => Some([1, most]),
-    });
-    described(RangeList {
-        ranges: ranges.collect(),
-    })
+    let found = published.source.find_value_ranges(&ids);
+    let ranges = match tokio::time::timeout(app.options.patience, found).await {
+        Ok(found) => { found.into_iter() }
+            .map(|range| match range {
+                Ok(range) => range.map(|range| [range.min, range.max]),
+                // Whoever reads the chunk learns what is wrong with it.
+                Err(_) => Some([1, most]),
+            })
+            .collect(),
+        // To know less costs less than to wait.
+        Err(_) => vec![Some([1, most]); ids.len()],
+    };
+    described(RangeList { ranges })
 }
 
 fn bad_request(error: String) -> Response {

@@ -19,9 +19,15 @@ pub struct Status {
     pub sections: Option<u64>,
     /// Tiles that are announced but whose files are not whole yet; `None` likewise.
     pub waiting: Option<u64>,
+    /// Tiles that are announced and whole, and not taken in yet; `None` likewise.
+    #[serde(default)]
+    pub queued: Option<u64>,
     /// Transforms whose tile has not come yet; `None` likewise.
     pub early_transforms: Option<u64>,
     /// Files that could not be taken in.
+    #[serde(default)]
+    pub set_aside: u64,
+    /// The first hundred of them.
     pub quarantined: Vec<Quarantined>,
     /// Tiles that were taken in, and could not be read when the server looked at them last.
     #[serde(default)]
@@ -42,8 +48,8 @@ pub struct DamagedTile {
     pub reason: String,
 }
 
-/// Damaged tiles that are listed.
-const LISTED: usize = 100;
+/// Files set aside, and damaged tiles, that are listed: a mistake in the settings sets aside all that come.
+const LISTED: u32 = 100;
 
 impl Status {
     /// The same, with what a source could not read.
@@ -56,7 +62,7 @@ impl Status {
         };
         Self {
             damaged: damage.len() as u64,
-            damaged_tiles: damage.into_iter().take(LISTED).map(tile).collect(),
+            damaged_tiles: damage.into_iter().take(LISTED as usize).map(tile).collect(),
             ..self
         }
     }
@@ -113,7 +119,8 @@ impl CatalogStatus {
 
     async fn read(&self) -> Result<Status, CatalogError> {
         let statistics = self.catalog.statistics(&self.volume).await?;
-        let quarantined = self.catalog.quarantined(&self.volume).await?;
+        let quarantined = self.catalog.first_quarantined(&self.volume, LISTED);
+        let quarantined = quarantined.await?;
         let file = |q: saccade_archive::catalog::Quarantined| Quarantined {
             file: q.file,
             tile: q.tile,
@@ -124,7 +131,9 @@ impl CatalogStatus {
             tiles: Some(statistics.tiles),
             sections: Some(statistics.sections),
             waiting: Some(statistics.waiting),
+            queued: Some(statistics.queued),
             early_transforms: Some(statistics.early),
+            set_aside: statistics.quarantined,
             quarantined: quarantined.into_iter().map(file).collect(),
             ..Status::default()
         })

@@ -1,10 +1,12 @@
 //! A small picture of a volume: one section of a coarse level.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::http::HeaderValue;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE, ETAG, HeaderMap};
 use axum::response::{IntoResponse, Response};
+use futures::FutureExt;
 use futures::future::try_join_all;
 use glam::{UVec2, UVec3};
 use saccade_core::volume::{Dtype, Volume};
@@ -12,6 +14,7 @@ use saccade_core::voxel_box::VoxelBox;
 use saccade_source::{Chunk, ChunkError, ChunkId};
 
 use crate::http::{Tag, not_found, try_again};
+use crate::lingering::Lingers;
 use crate::pieces::failed;
 use crate::volumes::Published;
 
@@ -24,7 +27,7 @@ const CLIPPED: f64 = 0.01;
 
 /// Draws the section nearest to the middle in which anything was acquired.
 pub(crate) async fn thumbnail(
-    published: &Published,
+    published: &Arc<Published>,
     headers: &HeaderMap,
     patience: Duration,
 ) -> Response {
@@ -32,11 +35,17 @@ pub(crate) async fn thumbnail(
     if let Some(answer) = tag.precondition(headers) {
         return answer;
     }
-    let section = match tokio::time::timeout(patience, section(published)).await {
+    let mut drawing = Box::pin(section(published.clone()));
+    let section = match tokio::time::timeout(patience, &mut drawing).await {
         Ok(Ok(Some(section))) => section,
         Ok(Ok(None)) => return not_found("nothing was acquired yet", Vec::new()),
         Ok(Err(error)) => return failed(published, &error),
-        Err(_) => return try_again("the picture takes long", Duration::from_secs(1)),
+        Err(_) => {
+            published
+                .lingering
+                .go_on(Lingers::Thumbnail, drawing.map(drop));
+            return try_again("the picture takes long", Duration::from_secs(1));
+        }
     };
     let headers = [
         (CONTENT_TYPE, HeaderValue::from_static("image/png")),
@@ -52,8 +61,8 @@ struct Section {
     values: Vec<u16>,
 }
 
-async fn section(published: &Published) -> Result<Option<Section>, ChunkError> {
-    let volume = published.volume();
+async fn section(published: Arc<Published>) -> Result<Option<Section>, ChunkError> {
+    let (published, volume) = (&published, published.volume());
     let level = level(volume);
     let chunks = volume.chunks(level);
     let middle = volume.levels[level].extent.z / 2;
@@ -163,7 +172,6 @@ mod tests {
     use super::*;
     use glam::DVec3;
     use saccade_source::memory::ArraySource;
-    use std::sync::Arc;
 
     #[test]
     fn the_middle_comes_first_and_nothing_twice() {
@@ -200,8 +208,8 @@ mod tests {
             .build()
             .unwrap();
         let section = runtime.block_on(async {
-            let published = Published::new(source, None);
-            section(&published).await.unwrap().unwrap()
+            let published = Arc::new(Published::new(source, None));
+            section(published).await.unwrap().unwrap()
         });
         let (size, pixels) = pixels(&png(&section));
         assert_eq!(size, UVec2::new(70, 45), "level 0 is small enough");

@@ -16,6 +16,7 @@ use tokio::time::Instant;
 
 use crate::history::{Cursor, History};
 use crate::http::Tag;
+use crate::lingering::Lingering;
 use crate::status::StatusSource;
 
 /// Between two messages that chunks of a volume take long.
@@ -84,6 +85,8 @@ pub(crate) struct Published {
     follower: JoinHandle<()>,
     /// When it was told last that a chunk takes long.
     told_of_late: Mutex<Option<Instant>>,
+    /// Reads that took too long for one answer.
+    pub(crate) lingering: Lingering,
 }
 
 impl Published {
@@ -121,6 +124,7 @@ impl Published {
             end,
             follower,
             told_of_late: Mutex::new(None),
+            lingering: Lingering::default(),
         }
     }
 

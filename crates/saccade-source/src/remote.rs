@@ -31,6 +31,11 @@ pub use status::{Quarantined, Status, StatusReader};
 /// Header of a server's answers that names an id of labels which is another number in the volume, once it has met one: see
 /// [`VolumeSource::renamed_label`].
 pub const RENAMED_LABEL: &str = "saccade-renamed-label";
+/// Header of a server's answer (404) for a chunk in which nothing was acquired: a volume that is not there is answered 404 as
+/// well.
+pub const NOTHING_ACQUIRED: &str = "saccade-nothing-acquired";
+/// Longest description that a server may give \[bytes\].
+const LARGEST_JSON: usize = 16 << 20;
 /// Largest chunk a server may announce \[bytes\].
 const LARGEST_CHUNK: u64 = 1 << 28;
 
@@ -121,7 +126,10 @@ impl RemoteError {
     fn is_transient(&self) -> bool {
         match self {
             Self::Http { .. } | Self::Idle { .. } => true,
-            Self::Status { status, .. } => status.is_server_error(),
+            // A server that has started again offers its volumes one by one.
+            Self::Status { status, .. } => {
+                status.is_server_error() || *status == StatusCode::NOT_FOUND
+            }
             // Cut short by somebody on the way; too long is a misunderstanding.
             Self::Length { expected, got, .. } => got < expected,
             Self::Address { .. } | Self::Answer { .. } => false,
@@ -397,7 +405,17 @@ async fn get_json<T: DeserializeOwned>(
                 url: url.clone(),
             });
         }
-        answer.bytes().await.map_err(|e| http(e, url.clone()))
+        let mut bytes = Vec::new();
+        let mut body = answer.bytes_stream();
+        while let Some(more) = body.next().await {
+            bytes.extend_from_slice(&more.map_err(|e| http(e, url.clone()))?);
+            if bytes.len() > LARGEST_JSON {
+                let source = std::io::Error::other("it is longer than any Saccade server's");
+                let (source, url) = (source.into(), url.clone());
+                return Err(RemoteError::Answer { source, url });
+            }
+        }
+        Ok(bytes)
     };
     let bytes = within(options.idle, &url, get).await??;
     serde_json::from_slice(&bytes).map_err(|source| {

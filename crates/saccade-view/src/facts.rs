@@ -6,6 +6,8 @@ use saccade_source::remote::Status as Acquisition;
 use saccade_stream::{Channel, Status};
 use serde::Serialize;
 
+use crate::detail::text_of;
+
 /// What is known about the picture on the screen.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Facts<'a> {
@@ -153,17 +155,19 @@ fn of_acquisition(acquisition: &Acquisition) -> Vec<Piece> {
     }
     if !acquisition.quarantined.is_empty() {
         let files = &acquisition.quarantined;
+        // Not all are listed.
+        let all = acquisition.set_aside.max(files.len() as u64);
         let mut bad = piece(
             Tone::Bad,
-            format!("{} set aside", count(files.len() as u64, "file")),
+            format!("{} set aside", count(all, "file")),
         );
         let mut named: Vec<String> = files
             .iter()
             .take(MAX_NAMED)
             .map(|q| format!("{}: {}", q.file, q.reason))
             .collect();
-        if files.len() > MAX_NAMED {
-            named.push(format!("and {} more", files.len() - MAX_NAMED));
+        if all > named.len() as u64 {
+            named.push(format!("and {} more", all - named.len() as u64));
         }
         bad.more = Some(named.join("\n"));
         pieces.push(bad);
@@ -209,12 +213,14 @@ pub(crate) struct PageStatus<'a> {
     pub(crate) transfer: Option<&'a TransferFunction>,
     /// Those that are seen, as `?channels=` takes them.
     pub(crate) channels: Vec<u32>,
+    /// How finely those are drawn, as `?detail=` takes it.
+    pub(crate) detail: String,
     /// Requests in flight.
     pub(crate) requests: usize,
     /// The newest failure, in words.
     pub(crate) failure: Option<&'a str>,
     pub(crate) tiles: Option<u64>,
-    pub(crate) quarantined: usize,
+    pub(crate) quarantined: u64,
 }
 
 impl<'a> PageStatus<'a> {
@@ -226,7 +232,8 @@ impl<'a> PageStatus<'a> {
         channels: &'a [Channel],
     ) -> Self {
         let status = facts.status;
-        let seen = || (0..).zip(channels).filter(|(_, channel)| channel.visible);
+        let seen = || (0_u32..).zip(channels).filter(|(_, c)| c.visible);
+        let details = seen().map(|(index, c)| format!("{index}:{}", text_of(&c.detail)));
         Self {
             volume,
             revision: status.revision,
@@ -243,10 +250,13 @@ impl<'a> PageStatus<'a> {
             size: size.to_array(),
             transfer: seen().next().map(|(_, channel)| &channel.transfer),
             channels: seen().map(|(index, _)| index).collect(),
+            detail: details.collect::<Vec<_>>().join(","),
             requests: status.progress.in_flight,
             failure: status.progress.failure.as_deref(),
             tiles: facts.acquisition.and_then(|a| a.tiles),
-            quarantined: facts.acquisition.map_or(0, |a| a.quarantined.len()),
+            quarantined: facts.acquisition.map_or(0, |a| {
+                a.set_aside.max(a.quarantined.len() as u64)
+            }),
         }
     }
 }
@@ -446,7 +456,10 @@ mod tests {
             },
             automatic: true,
             iso: None,
-            detail: saccade_stream::Detail::Full,
+            detail: saccade_stream::Detail::Chosen {
+                levels: 1..=4,
+                coarser: 1,
+            },
             finest_needed: 0,
         };
         let seen = Channel {
@@ -469,5 +482,6 @@ mod tests {
         let back: TransferFunction = serde_json::from_value(json["transfer"].clone()).unwrap();
         assert_eq!(back, transfer);
         assert_eq!(json["channels"], serde_json::json!([1]));
+        assert_eq!(json["detail"], "1:1-4+1");
     }
 }

@@ -332,6 +332,7 @@ fn told(status: saccade_serve::Status) -> Status {
         revision: status.revision,
         tiles: status.tiles,
         sections: status.sections,
+        set_aside: status.set_aside,
         quarantined: status.quarantined.into_iter().map(file).collect(),
         damaged: status.damaged,
         damaged_tiles: status.damaged_tiles.into_iter().map(tile).collect(),

@@ -33,11 +33,10 @@ impl Limits {
     /// What a client must take of an answer in the time [`Self::pace`], if there is as much.
     pub const PACE_BYTES: usize = 16 * 1024;
 
-    /// The same, with connections that leave a quarter of the process's files to other uses.
+    /// The same, with connections that leave files of the process to other uses.
     pub(super) fn within_open_files(self) -> Self {
-        let most = open_files() / 4 * 3;
         Self {
-            connections: self.connections.min(most).max(1),
+            connections: self.connections.min(for_connections(open_files())).max(1),
             ..self
         }
     }
@@ -47,6 +46,16 @@ impl Default for Limits {
     fn default() -> Self {
         Self::DEFAULT
     }
+}
+
+/// How many of so many files connections may take: some hundreds are left for a cache on disk and for pyramids, unless
+/// connections would get less than a quarter.
+fn for_connections(files: usize) -> usize {
+    /// Files of the largest cache on disk, and of reads under way.
+    const OTHERS: usize = 600;
+    (files / 4 * 3)
+        .min(files.saturating_sub(OTHERS))
+        .max(files / 4)
 }
 
 /// How many files this process may have open, by what Linux says; elsewhere the smallest usual number.
@@ -85,6 +94,18 @@ mod tests {
             Some(usize::MAX)
         );
         assert_eq!(soft_limit("nothing of the kind"), None);
+    }
+
+    #[test]
+    fn files_are_left_for_a_cache_on_disk() {
+        for (files, connections) in [
+            (256, 64),
+            (1024, 424),
+            (4096, 3072),
+            (usize::MAX, usize::MAX / 4 * 3),
+        ] {
+            assert_eq!(for_connections(files), connections, "{files}");
+        }
     }
 
     #[test]

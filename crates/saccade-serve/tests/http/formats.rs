@@ -9,6 +9,7 @@ use reqwest::{Method, Response};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_serve::Options;
 use saccade_source::VolumeSource;
+use saccade_source::remote::NOTHING_ACQUIRED;
 use serde_json::json;
 
 use super::server::never;
@@ -143,6 +144,7 @@ fn every_format_answers_as_the_standard_says() {
                 let nothing = nothing.send().await.unwrap();
                 assert_eq!(nothing.status(), StatusCode::NOT_FOUND);
                 let headers = nothing.headers();
+                assert!(header(headers, NOTHING_ACQUIRED).is_some());
                 assert_eq!(header(headers, "access-control-allow-origin"), Some("*"));
                 assert_eq!(header(headers, "cache-control"), Some("no-store"));
             }

@@ -1,9 +1,11 @@
 //! Sources in trouble, servers in trouble.
 
-use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use futures::StreamExt;
+use futures::future::WeakShared;
+use futures::{FutureExt, StreamExt};
 use glam::UVec3;
 use reqwest::StatusCode;
 use saccade_archive::catalog::{CatalogError, CatalogLocation};
@@ -14,7 +16,7 @@ use saccade_source::stitched::StitchError;
 use saccade_source::{Change, Chunk, ChunkError, ChunkId, Damage, VolumeSource};
 use serde_json::Value;
 
-use super::{header, run, serve, serve_source, volume};
+use super::{CHUNK, header, run, serve, serve_source, volume};
 
 /// What becomes of a read; `None`: it never ends.
 type Trouble = fn(ChunkId) -> Option<ChunkError>;
@@ -193,6 +195,82 @@ fn trouble_says_whether_to_ask_again() {
                     "{cause}"
                 );
             }
+        }
+    });
+}
+
+/// A source that reads once for all who ask at the same time, takes its time, and keeps what was read to the end.
+struct Slow {
+    volume: Arc<Volume>,
+    takes: Duration,
+    begun: AtomicUsize,
+    ended: Arc<AtomicBool>,
+    reading: Mutex<Option<WeakShared<BoxFuture<'static, Chunk>>>>,
+}
+
+impl VolumeSource for Slow {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.volume
+    }
+
+    fn read(&self, _: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        let bytes = vec![7; CHUNK.element_product() as usize];
+        let chunk = Chunk::Voxels(bytes.into());
+        if self.ended.load(Ordering::SeqCst) {
+            return Box::pin(async { Ok(chunk) });
+        }
+        let mut reading = self.reading.lock().unwrap();
+        let under_way = reading.as_ref().and_then(WeakShared::upgrade);
+        let read = under_way.unwrap_or_else(|| {
+            self.begun.fetch_add(1, Ordering::SeqCst);
+            let (takes, ended) = (self.takes, self.ended.clone());
+            let read: BoxFuture<'static, Chunk> = Box::pin(async move {
+                tokio::time::sleep(takes).await;
+                ended.store(true, Ordering::SeqCst);
+                chunk
+            });
+            let read = read.shared();
+            *reading = read.downgrade();
+            read
+        });
+        Box::pin(read.map(Ok))
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        futures::stream::pending().boxed()
+    }
+}
+
+#[test]
+fn what_takes_longer_than_an_answer_may_is_there_in_the_end() {
+    run(async {
+        for path in ["zarr/0/c/0/1/1/1", "thumbnail.png"] {
+            let source = Arc::new(Slow {
+                volume: Arc::new(volume()),
+                takes: Duration::from_millis(1500),
+                begun: AtomicUsize::new(0),
+                ended: Arc::default(),
+                reading: Mutex::new(None),
+            });
+            let options = Options {
+                patience: Duration::from_millis(300),
+                ..Options::DEFAULT
+            };
+            let (url, _stop, _) = serve_source(source.clone(), options).await;
+            let mut late = 0;
+            let answer = loop {
+                let answer = reqwest::get(format!("{url}v/em/{path}")).await.unwrap();
+                if answer.status() != StatusCode::SERVICE_UNAVAILABLE {
+                    break answer;
+                }
+                late += 1;
+                assert!(late < 60, "{path} is never there");
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            };
+            assert_eq!(answer.status(), StatusCode::OK, "{path}");
+            assert!(late >= 2, "{path} was not late");
+            let begun = source.begun.load(Ordering::SeqCst);
+            assert_eq!(begun, 1, "{path} was begun anew");
         }
     });
 }

@@ -9,7 +9,7 @@ use futures::StreamExt;
 use reqwest::{StatusCode, Url, header};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::{RENAMED_LABEL, RemoteError, RemoteSource, joined, refusal, within};
+use super::{NOTHING_ACQUIRED, RENAMED_LABEL, RemoteError, RemoteSource, joined, refusal, within};
 use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId};
 
 /// When to ask again, where the server does not say.
@@ -103,7 +103,9 @@ impl RemoteSource {
         }
         match answer.status() {
             StatusCode::OK => {}
-            StatusCode::NOT_FOUND => return Ok(Answer::Empty),
+            StatusCode::NOT_FOUND if answer.headers().contains_key(NOTHING_ACQUIRED) => {
+                return Ok(Answer::Empty);
+            }
             StatusCode::SERVICE_UNAVAILABLE | StatusCode::TOO_MANY_REQUESTS => {
                 let retry_after = retry_after(answer.headers());
                 let cause = within(idle, &url, refusal(answer)).await?.cause;

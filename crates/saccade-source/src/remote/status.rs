@@ -15,6 +15,9 @@ pub struct Status {
     /// Sections with at least one tile; `None` where the volume is not made of tiles.
     pub sections: Option<u64>,
     /// Files that could not be taken in.
+    #[serde(default)]
+    pub set_aside: u64,
+    /// The first of them.
     pub quarantined: Vec<Quarantined>,
     /// Tiles that were taken in and could not be read when they were looked at last.
     #[serde(default)]

@@ -169,6 +169,8 @@ fn failures_are_told_apart_and_pass() {
             (Fault::Status("500 Internal Server Error"), true),
             (Fault::Status("504 Gateway Timeout"), true),
             (Fault::Status("403 Forbidden"), false),
+            // Of a volume that is not there: nothing acquired is told otherwise.
+            (Fault::Status("404 Not Found"), true),
         ] {
             // Connections that were open before may break unasked; one fault for each attempt.
             server.faults.lock().unwrap().extend([fault, fault, fault]);

@@ -10,6 +10,7 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 
+use super::super::NOTHING_ACQUIRED;
 use crate::memory::ArraySource;
 use crate::{Change, ChangeReason, Chunk, ChunkId, VolumeSource};
 use saccade_core::voxel_box::VoxelBox;
@@ -219,7 +220,8 @@ impl Server {
             chunk,
         };
         let Ok(Chunk::Voxels(mut bytes)) = self.source.read(id).await else {
-            return answer(stream, "404 Not Found", b"nothing acquired").await;
+            let head = format!("404 Not Found\r\n{NOTHING_ACQUIRED}: 1");
+            return answer(stream, &head, b"nothing acquired").await;
         };
         let head = format!("HTTP/1.1 200 OK\r\ncontent-length: {}\r\n\r\n", bytes.len());
         let fault = self.faults.lock().unwrap().pop_front();
