@@ -1,6 +1,6 @@
 //! From a transfer function to the table that shaders read, and to what it hides.
 
-use saccade_core::transfer::{TABLE_LEN, TransferFunction};
+use saccade_core::transfer::{OpacityPoint, TABLE_LEN, TransferFunction};
 use saccade_core::volume::{Dtype, Polarity};
 
 use crate::channel::ChannelView;
@@ -13,7 +13,7 @@ const OPAQUE: f64 = 1e6;
 /// A channel's colours by stored value.
 ///
 /// Entry `i` belongs to stored value `(i - offset) / scale`. 8-bit values have an entry each; of 16-bit ones
-/// the entries share the range in which the transfer function changes, so that a narrow window is as smooth as a wide one.
+/// the entries share the range in which what is drawn changes, so that a narrow window is as smooth as a wide one.
 #[derive(Clone, Debug)]
 pub(crate) struct TransferTable {
     /// Linear RGB, extinction \[1/nm\].
@@ -54,7 +54,7 @@ impl TransferTable {
     pub(crate) fn new(view: &ChannelView, dtype: Dtype, mode: Mode) -> Self {
         let largest = f64::from(largest(dtype));
         let (first, span) = match dtype {
-            Dtype::Uint16 => domain(view, largest),
+            Dtype::Uint16 => domain(view, largest, mode),
             _ => (0.0, largest),
         };
         let last_entry = (TABLE_LEN - 1) as f64;
@@ -132,11 +132,17 @@ impl TransferTable {
     }
 }
 
-/// The stored values between which a channel's colours change: the first, and how many.
-fn domain(view: &ChannelView, largest: f64) -> (f64, f64) {
+/// The stored values between which a channel's colours change: the first, and how many. Beyond them it looks as
+/// at their ends.
+fn domain(view: &ChannelView, largest: f64, mode: Mode) -> (f64, f64) {
     let transfer = &view.transfer;
-    let corners = transfer.opacity.iter().map(|point| point.value);
-    let corners = corners.chain(transfer.window).chain([view.iso]);
+    let corners = match mode {
+        Mode::EmissionAbsorption => changing(&transfer.opacity),
+        Mode::Maximum | Mode::IsoSurface => &[],
+    };
+    let corners = corners.iter().map(|point| point.value);
+    let iso = (mode == Mode::IsoSurface).then_some(view.iso);
+    let corners = corners.chain(transfer.window).chain(iso);
     let corners = corners.map(|value| f64::from(value) * largest);
     let corners = corners.filter(|value| value.is_finite());
     let (low, high) = corners.fold((largest, 0.0_f64), |(low, high), value| {
@@ -149,6 +155,20 @@ fn domain(view: &ChannelView, largest: f64) -> (f64, f64) {
     let low = low.clamp(0.0, largest).floor();
     let span = (high - low).clamp((TABLE_LEN - 1) as f64, largest);
     (low.min(largest - span), span)
+}
+
+/// Corners without those before the first and after the last change of opacity.
+fn changing(corners: &[OpacityPoint]) -> &[OpacityPoint] {
+    if !corners.is_sorted_by(|a, b| a.value <= b.value) {
+        return corners;
+    }
+    let differ = |pair: &[OpacityPoint]| pair[0].opacity != pair[1].opacity;
+    let first = corners.windows(2).position(differ);
+    let last = corners.windows(2).rposition(differ);
+    match first.zip(last) {
+        Some((first, last)) => &corners[first..last + 2],
+        None => &[],
+    }
 }
 
 /// Extinction of a measured value in `[0, 1]` \[1/nm\]: opacity in a form in which interpolation and step length
@@ -171,7 +191,7 @@ fn single(value: f64) -> f32 {
 #[expect(clippy::cast_possible_truncation, reason = "values are made to fit")]
 mod tests {
     use super::*;
-    use saccade_core::transfer::{ColorMap, OpacityPoint};
+    use saccade_core::transfer::ColorMap;
 
     fn view(polarity: Polarity, points: &[(f32, f32)], window: [f32; 2]) -> ChannelView {
         let point = |&(value, opacity): &(f32, f32)| OpacityPoint { value, opacity };
@@ -230,6 +250,69 @@ mod tests {
                 let off = (got - want).abs();
                 assert!(off < 3e-4, "{polarity:?} {measured}: {got} not {want}");
             }
+        }
+    }
+
+    /// Corners at the ends of all values, and a surface where none is drawn, take no entries away.
+    #[test]
+    fn entries_lie_where_colours_change() {
+        let at = |counts: f32| counts / 65_535.0;
+        let points = [
+            (0.0, 0.0),
+            (at(300.0), 0.0),
+            (at(1300.0), 0.9),
+            (at(50_000.0), 0.9),
+            (1.0, 0.9),
+        ];
+        for polarity in [Polarity::Bright, Polarity::Dark] {
+            let mut view = view(polarity, &points, [at(200.0), at(1400.0)]);
+            view.iso = at(30_000.0);
+            // 1200 values on 255 steps between entries.
+            let spacing = |view: &ChannelView, mode| {
+                let table = TransferTable::new(view, Dtype::Uint16, mode);
+                1.0 / f64::from(table.scale)
+            };
+            for mode in [Mode::EmissionAbsorption, Mode::Maximum] {
+                let spacing = spacing(&view, mode);
+                assert!(spacing <= 5.0, "{polarity:?} {mode:?}: {spacing} values");
+            }
+            // Where surfaces are drawn theirs has to be in the table.
+            let with_iso = spacing(&view, Mode::IsoSurface);
+            assert!((100.0..120.0).contains(&with_iso), "{with_iso}");
+            view.iso = at(900.0);
+            assert!(spacing(&view, Mode::IsoSurface) <= 5.0);
+            // One that changes far away does count.
+            view.transfer.opacity[3].opacity = 0.8;
+            let wide = spacing(&view, Mode::EmissionAbsorption);
+            assert!(wide > 250.0, "{polarity:?}: {wide} values");
+        }
+    }
+
+    /// Also beyond the first and the last entry the table says what the transfer function says.
+    #[test]
+    fn flat_ends_are_as_opaque_as_they_should_be() {
+        let at = |counts: f32| counts / 65_535.0;
+        let points = [(0.0, 0.7), (at(300.0), 0.7), (at(1300.0), 0.2), (1.0, 0.2)];
+        for polarity in [Polarity::Bright, Polarity::Dark] {
+            let view = view(polarity, &points, [at(200.0), at(1400.0)]);
+            let table = table(&view, Dtype::Uint16);
+            for measured in (1..u16::MAX).step_by(7) {
+                let stored = match polarity {
+                    Polarity::Bright => measured,
+                    Polarity::Dark => measured.wrapping_neg(),
+                };
+                let x = (f32::from(stored) * table.scale + table.offset).clamp(0.0, 255.0);
+                let (low, t) = (x.floor().min(254.0), x - x.floor().min(254.0));
+                let [a, b] = [low, low + 1.0].map(|i| table.colors[i as usize]);
+                let value = at(f32::from(measured));
+                let want = extinction(&view.transfer, f64::from(value)) as f32;
+                let off = (a[3] + t * (b[3] - a[3]) - want).abs();
+                assert!(off < 3e-4, "{polarity:?} {measured}: off by {off}");
+                let [red, ..] = view.transfer.color_at(value);
+                let off = (a[0] + t * (b[0] - a[0]) - red).abs();
+                assert!(off < 3e-3, "{polarity:?} {measured}: off by {off}");
+            }
+            assert!(!table.hides(1, 1) && !table.hides(60_000, 65_535));
         }
     }
 
