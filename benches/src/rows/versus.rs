@@ -231,7 +231,7 @@ pub(crate) fn vs_page_tables() -> Result<Vec<Row>> {
     };
     let (mut ours, with) = prepare(Traversal::ResidencyOctree)?;
     let (mut theirs, without) = prepare(Traversal::PageTables)?;
-    let samples = f64::from(without.samples) / f64::from(with.samples.max(1));
+    let samples = without.samples as f64 / with.samples.max(1) as f64;
     let [ratios, theirs, ours] = ratios(
         || frame_ms(&mut theirs, &view),
         || frame_ms(&mut ours, &view),

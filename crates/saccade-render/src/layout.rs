@@ -48,7 +48,7 @@ pub(crate) const COUNTERS: u32 = 16;
 pub(crate) const COUNT_MISSES: u32 = 0;
 /// Of those, out of date ones.
 pub(crate) const COUNT_STALE: u32 = 1;
-/// Samples taken.
+/// Samples taken: the lower word, see [`COUNT_SAMPLES_HIGH`].
 pub(crate) const COUNT_SAMPLES: u32 = 2;
 /// Entries read of the page directory and of page tables \[000 fig. 6\].
 pub(crate) const COUNT_LOOKUPS: u32 = 3;
@@ -68,6 +68,8 @@ pub(crate) const COUNT_RAYS: u32 = 8;
 pub(crate) const MOST_LOOKUPS: u32 = 9;
 /// `u32::MAX` less the entries read by the ray that read the fewest.
 pub(crate) const FEWEST_LOOKUPS: u32 = 10;
+/// Samples taken: the higher word.
+pub(crate) const COUNT_SAMPLES_HIGH: u32 = 11;
 
 /// Depths that a residency octree can have, its root's included.
 pub(crate) const MOST_DEPTHS: usize = 24;
@@ -241,6 +243,7 @@ const RAY_CAST: &str = concat!(
     include_str!("shaders/lib/frame.wgsl"),
     include_str!("shaders/lib/ray.wgsl"),
     include_str!("shaders/lib/color.wgsl"),
+    include_str!("shaders/lib/count.wgsl"),
     include_str!("shaders/memory.wgsl"),
     include_str!("shaders/octree.wgsl"),
     include_str!("shaders/ray_cast.wgsl"),
@@ -361,6 +364,7 @@ mod tests {
             ("COUNT_RAYS", COUNT_RAYS),
             ("MOST_LOOKUPS", MOST_LOOKUPS),
             ("FEWEST_LOOKUPS", FEWEST_LOOKUPS),
+            ("COUNT_SAMPLES_HIGH", COUNT_SAMPLES_HIGH),
             ("MOST_DEPTHS", u32::try_from(MOST_DEPTHS).unwrap()),
             ("SIBLINGS", SIBLINGS),
             ("NODE_ROW", NODE_ROW),

@@ -3,8 +3,8 @@
 use saccade_core::brick::{BrickId, MAX_LEVELS};
 
 use crate::layout::{
-    COUNT_LOOKUPS, COUNT_MISSES, COUNT_NODES, COUNT_RAYS, COUNT_SAMPLES, COUNT_STALE,
-    COUNT_SUBSTITUTED, COUNTERS, FEWEST_LOOKUPS, FINEST_LEVEL, MISSES, MOST_LOOKUPS,
+    COUNT_LOOKUPS, COUNT_MISSES, COUNT_NODES, COUNT_RAYS, COUNT_SAMPLES, COUNT_SAMPLES_HIGH,
+    COUNT_STALE, COUNT_SUBSTITUTED, COUNTERS, FEWEST_LOOKUPS, FINEST_LEVEL, MISSES, MOST_LOOKUPS,
     MOST_SUBSTITUTED_LEVELS,
 };
 
@@ -55,8 +55,8 @@ pub struct Fidelity {
 /// What the rays of a frame did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Statistics {
-    /// Samples taken. Wraps at 2³².
-    pub samples: u32,
+    /// Samples taken.
+    pub samples: u64,
     /// Rays that met the volume.
     pub rays: u32,
     /// Entries read of the page directory and of page tables \[000 fig. 6\].
@@ -159,7 +159,8 @@ impl<'a> RawReport<'a> {
 
     pub(crate) fn statistics(&self, bricks_used: u32, blocks_used: u32) -> Statistics {
         Statistics {
-            samples: self.counter(COUNT_SAMPLES),
+            samples: u64::from(self.counter(COUNT_SAMPLES_HIGH)) << 32
+                | u64::from(self.counter(COUNT_SAMPLES)),
             rays: self.counter(COUNT_RAYS),
             lookups: self.counter(COUNT_LOOKUPS),
             lookups_per_ray: match self.counter(COUNT_RAYS) {
@@ -174,5 +175,20 @@ impl<'a> RawReport<'a> {
             bricks_used,
             blocks_used,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_are_counted_beyond_one_word() {
+        let mut words = vec![0; (COUNTERS + 2 * MISSES) as usize];
+        words[COUNT_SAMPLES as usize] = 7;
+        let samples = |words: &[u32]| RawReport::new(words, 0).statistics(0, 0).samples;
+        assert_eq!(samples(&words), 7);
+        words[COUNT_SAMPLES_HIGH as usize] = 3;
+        assert_eq!(samples(&words), 3 * (1 << 32) + 7);
     }
 }

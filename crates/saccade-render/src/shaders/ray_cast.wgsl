@@ -759,7 +759,12 @@ fn main(
     }
     workgroupBarrier();
     if local == 0u {
-        atomicAdd(&report[COUNT_SAMPLES], atomicLoad(&tallies[COUNT_SAMPLES]));
+        // What one group takes fits one word, what a large picture takes may not.
+        let taken = atomicLoad(&tallies[COUNT_SAMPLES]);
+        let before = atomicAdd(&report[COUNT_SAMPLES], taken);
+        if carry_of(before, taken) > 0u {
+            atomicAdd(&report[COUNT_SAMPLES_HIGH], 1u);
+        }
         atomicAdd(&report[COUNT_LOOKUPS], atomicLoad(&tallies[COUNT_LOOKUPS]));
         atomicAdd(&report[COUNT_NODES], atomicLoad(&tallies[COUNT_NODES]));
         atomicAdd(&report[COUNT_SUBSTITUTED], atomicLoad(&tallies[COUNT_SUBSTITUTED]));

@@ -247,7 +247,7 @@ fn samples(renderer: &mut Renderer, view: &View) -> u64 {
     let mut before = u64::MAX;
     for _ in 0..40 {
         let report = frame(renderer, view);
-        let samples = u64::from(report.statistics.samples);
+        let samples = report.statistics.samples;
         if samples == before {
             return samples;
         }

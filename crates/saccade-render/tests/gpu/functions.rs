@@ -6,6 +6,7 @@ use crate::harness::gpu;
 
 const RAY: &str = include_str!("../../src/shaders/lib/ray.wgsl");
 const COLOR: &str = include_str!("../../src/shaders/lib/color.wgsl");
+const COUNT: &str = include_str!("../../src/shaders/lib/count.wgsl");
 
 /// The WGSL expression `expr`, a `vec4f`, of each `x: vec4f`, on the device.
 fn eval(gpu: &Gpu, lib: &str, expr: &str, inputs: &[[f32; 4]]) -> Vec<[f32; 4]> {
@@ -82,6 +83,27 @@ fn opacity_does_not_depend_on_the_step() {
             "step {step:?}: {got:?} instead of {want}"
         );
     }
+}
+
+/// Sums of two words are those of numbers that have room.
+#[test]
+fn counters_carry() {
+    let Some(gpu) = gpu() else { return };
+    // Multiples of 256 are exact in f32.
+    let most = 4_294_967_040.0_f32;
+    let mut inputs = Vec::new();
+    for before in [0.0, 256.0, 2_147_483_648.0, most] {
+        for added in [0.0, 256.0, 512.0, 2_147_483_648.0, most] {
+            inputs.push([before, added, 0.0, 0.0]);
+        }
+    }
+    let expr = "vec4f(f32(carry_of(u32(x.x), u32(x.y))), 0.0, 0.0, 0.0)";
+    let carries = eval(&gpu, COUNT, expr, &inputs);
+    for (input, carry) in inputs.iter().zip(&carries) {
+        let sum = input[0] as u64 + input[1] as u64;
+        assert_eq!(carry[0] as u64, sum >> 32, "{input:?}");
+    }
+    assert!(carries.iter().any(|c| c[0] > 0.0) && carries.iter().any(|c| c[0] == 0.0));
 }
 
 #[test]

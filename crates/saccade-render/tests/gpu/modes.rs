@@ -279,9 +279,12 @@ fn a_slice_has_one_sample_a_ray() {
         renderer.set_channels(&scene.views()).unwrap();
         let reports = settle(&mut renderer, &view, &scene);
         let statistics = reports.last().unwrap().statistics;
-        assert!(statistics.samples <= statistics.rays, "{statistics:?}");
         assert!(
-            statistics.samples > SIZE.element_product() / 8,
+            statistics.samples <= u64::from(statistics.rays),
+            "{statistics:?}"
+        );
+        assert!(
+            statistics.samples > u64::from(SIZE.element_product() / 8),
             "{statistics:?}"
         );
         let got = read(&renderer);

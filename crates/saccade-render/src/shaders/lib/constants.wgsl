@@ -43,6 +43,7 @@ const COUNT_RAYS = 8u;
 const MOST_LOOKUPS = 9u;
 const FEWEST_LOOKUPS = 10u;
 const TALLIES = 11u;
+const COUNT_SAMPLES_HIGH = 11u;
 
 const MOST_DEPTHS = 24u;
 const SIBLINGS = 8u;
