@@ -32,6 +32,7 @@
 
 mod acquisition;
 mod app;
+mod detail;
 mod facts;
 mod handover;
 mod navigate;
@@ -52,12 +53,13 @@ mod native;
 mod web;
 
 pub use acquisition::AcquisitionReader;
+pub use detail::details_from_text;
 pub use options::{BackgroundError, ViewOptions, background_from_text, set_details, show_channels};
 pub use page::{PageError, PageOptions};
 pub use plane::{Plane, plane_from_text};
 pub use shown::{
-    MOST_CUTS, OutsideError, Shown, ShownError, box_from_text, channels_from_text,
-    details_from_text, heat_from_text, mode_from_text, thickness_from_text,
+    MOST_CUTS, OutsideError, Shown, ShownError, box_from_text, channels_from_text, heat_from_text,
+    mode_from_text, thickness_from_text,
 };
 
 #[cfg(not(target_family = "wasm"))]

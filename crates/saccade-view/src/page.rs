@@ -4,11 +4,12 @@ use saccade_core::camera::{Camera, ParseCameraError};
 use saccade_core::transfer::TransferFunction;
 use saccade_source::objects::{Location, LocationError};
 
+use crate::detail::details_from_text;
 use crate::options::{BackgroundError, ViewOptions, background_from_text};
 use crate::plane::plane_from_text;
 use crate::shown::{
-    MOST_CUTS, ShownError, box_from_text, channels_from_text, details_from_text, heat_from_text,
-    mode_from_text, thickness_from_text,
+    MOST_CUTS, ShownError, box_from_text, channels_from_text, heat_from_text, mode_from_text,
+    thickness_from_text,
 };
 
 /// What a page's address asks for.
@@ -168,7 +169,7 @@ mod tests {
             ("cut", "0,1,1@4,5,6"),
             ("cut", "z=2"),
             ("heat", "lookups=8"),
-            ("detail", "content,2:1"),
+            ("detail", "content,2:1-4+1"),
             ("ui", "off"),
         ]);
         let PageOptions { volume, view, .. } = page.unwrap();
@@ -197,7 +198,11 @@ mod tests {
             }
         );
         assert_eq!(view.details[0], (None, saccade_stream::Detail::ByContent));
-        assert_eq!(view.details.len(), 2);
+        let bounded = saccade_stream::Detail::Chosen {
+            levels: 1..=4,
+            coarser: 1,
+        };
+        assert_eq!(view.details[1..], [(Some(2), bounded)]);
         assert!(!view.ui);
     }
 
@@ -241,6 +246,7 @@ mod tests {
             ("cut", "w=4"),
             ("heat", "fire"),
             ("detail", "nice"),
+            ("detail", "0:4-1"),
             ("ui", "maybe"),
         ] {
             let error = page(&[(name, value)]).unwrap_err().to_string();

@@ -7,6 +7,7 @@ use saccade_core::volume::{Polarity, Volume};
 use saccade_render::{Heat, Mode, Work};
 use saccade_stream::{Detail, Session};
 
+use crate::detail;
 use crate::facts::{Piece, Tone};
 use crate::plane::{AXES, Plane};
 use crate::shown::{MOST_CUTS, Shown, WORKS};
@@ -386,25 +387,29 @@ fn detail(ui: &mut Ui, session: &mut Session, selected: u32) {
         return;
     };
     let (before, needed) = (channel.detail.clone(), channel.finest_needed);
-    let coarser = |coarser| Detail::Chosen {
-        levels: 0..=u32::MAX,
-        coarser,
-    };
+    let last = session.volume().levels.len().saturating_sub(1);
+    let last = u32::try_from(last).unwrap_or(u32::MAX);
+    let bounds = detail::bounds(&before, last);
+    let coarser = |coarser| detail::chosen(bounds, bounds, last, coarser);
     let mut detail = before.clone();
-    let name = |detail: &Detail| match detail {
-        Detail::Full => "as fine as the view".to_owned(),
-        Detail::ByContent if *detail == before && needed > 0 => {
-            format!("by content: from level {needed}")
-        }
-        Detail::ByContent => "by content".to_owned(),
-        Detail::Chosen { coarser: 1, .. } => "1 level coarser".to_owned(),
-        Detail::Chosen { coarser, .. } => format!("{coarser} levels coarser"),
+    let by_content = before == Detail::ByContent;
+    let now = match detail::coarser(&before) {
+        _ if by_content && needed > 0 => format!("by content: from level {needed}"),
+        _ if by_content => "by content".to_owned(),
+        0 => "as fine as the view".to_owned(),
+        1 => "1 level coarser".to_owned(),
+        levels => format!("{levels} levels coarser"),
     };
     egui::ComboBox::from_label("Detail")
-        .selected_text(name(&before))
+        .selected_text(now)
         .show_ui(ui, |ui| {
-            for choice in [Detail::Full, Detail::ByContent, coarser(1), coarser(2), coarser(3)] {
-                let text = name(&choice);
+            for (choice, text) in [
+                (coarser(0), "as fine as the view"),
+                (Detail::ByContent, "by content"),
+                (coarser(1), "1 level coarser"),
+                (coarser(2), "2 levels coarser"),
+                (coarser(3), "3 levels coarser"),
+            ] {
                 ui.selectable_value(&mut detail, choice, text);
             }
         })
@@ -413,6 +418,18 @@ fn detail(ui: &mut Ui, session: &mut Session, selected: u32) {
             "Coarser channels leave memory to others. By content: levels that differ by less than a \
              hundredth from the next coarser one are left out.",
         );
+    // By content, levels are found and not chosen.
+    if last > 0 && !by_content {
+        let mut moved = bounds;
+        let [finest, coarsest] = &mut moved;
+        let finest = ui.add(Slider::new(finest, 0..=last).text("finest level"));
+        finest.on_hover_text("No finer one is drawn, however near it is; 0 is the finest there is");
+        let coarsest = ui.add(Slider::new(coarsest, 0..=last).text("coarsest level"));
+        coarsest.on_hover_text("No coarser one is drawn, however far it is");
+        if moved != bounds {
+            detail = detail::chosen(moved, bounds, last, detail::coarser(&before));
+        }
+    }
     if detail != before
         && let Err(error) = session.set_detail(selected, detail)
     {

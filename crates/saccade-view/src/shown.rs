@@ -4,7 +4,6 @@ use glam::DVec3;
 use saccade_core::space::Point;
 use saccade_core::volume::Volume;
 use saccade_render::{Clip, Heat, Mode, Work};
-use saccade_stream::Detail;
 
 use crate::plane::{AXES, Plane};
 
@@ -129,39 +128,6 @@ pub fn heat_from_text(text: &str) -> Result<Heat, ShownError> {
         || {
             let wanted = "lookups, nodes or samples, and what is drawn white, as in nodes=40";
             ShownError::of(text, "work of rays", wanted)
-        },
-        Ok,
-    )
-}
-
-/// How finely channels are drawn: `full`, `content` or levels coarser, as in `1`; for all of them, or each as in
-/// `0:full,3:2`.
-///
-/// # Errors
-///
-/// [`ShownError`] on anything else.
-pub fn details_from_text(text: &str) -> Result<Vec<(Option<u32>, Detail)>, ShownError> {
-    let one = |text: &str| {
-        let (channel, detail) = match text.split_once(':') {
-            Some((channel, detail)) => (Some(channel.trim().parse().ok()?), detail),
-            None => (None, text),
-        };
-        let detail = match detail.trim() {
-            "full" => Detail::Full,
-            "content" => Detail::ByContent,
-            levels => Detail::Chosen {
-                levels: 0..=u32::MAX,
-                coarser: levels.parse().ok()?,
-            },
-        };
-        Some((channel, detail))
-    };
-    let details: Option<Vec<_>> = text.split(',').map(one).collect();
-    details.map_or_else(
-        || {
-            let wanted =
-                "full, content or a number of levels, for all channels or each, as in 0:full,3:2";
-            ShownError::of(text, "detail of channels", wanted)
         },
         Ok,
     )
@@ -340,19 +306,6 @@ mod tests {
         assert_eq!(heat_from_text("samples"), heat(Work::Samples, 512.0));
         for bad in ["", "node", "nodes=", "nodes=0", "nodes=NaN", "nodes=-1"] {
             assert!(heat_from_text(bad).is_err(), "{bad:?}");
-        }
-        let chosen = |coarser| Detail::Chosen {
-            levels: 0..=u32::MAX,
-            coarser,
-        };
-        let each = vec![
-            (Some(0), Detail::Full),
-            (Some(3), chosen(2)),
-            (None, Detail::ByContent),
-        ];
-        assert_eq!(details_from_text("0:full, 3:2,content"), Ok(each));
-        for bad in ["", "fine", "a:full", "0:", "0:-1", "0:1:2", ","] {
-            assert!(details_from_text(bad).is_err(), "{bad:?}");
         }
         assert_eq!(thickness_from_text("40.5"), Ok(40.5));
         for bad in ["", "-1", "NaN", "inf", "4nm"] {

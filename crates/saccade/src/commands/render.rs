@@ -111,7 +111,8 @@ pub(crate) struct Render {
     heat: Option<Heat>,
 
     /// How finely channels are drawn: full, content (no level that differs by less than a hundredth from the next
-    /// coarser one), or levels coarser than the view asks for; for all channels, or each as in 0:full,3:2
+    /// coarser one), levels coarser than the view asks for, as in 2, or the levels that are drawn, 0 the finest, as
+    /// in 1-4, 1- or 1-4+1 (one coarser than the view asks for); for all channels, or each as in 0:full,2:1-4+1
     #[arg(long, value_name = "DETAIL,...", value_parser = details, default_value = "full")]
     detail: Details,
 

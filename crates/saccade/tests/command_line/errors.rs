@@ -454,7 +454,7 @@ fn no_gpu() {
 
 #[test]
 fn words_that_make_no_sense() {
-    let cases: [(&[&str], &[&str]); 18] = [
+    let cases: [(&[&str], &[&str]); 19] = [
         (
             &["simulate", "a", "--input", "b", "--extent", "9,9,9"],
             &["--extent", "cannot be used with", "--input"],
@@ -496,6 +496,10 @@ fn words_that_make_no_sense() {
         (
             &["render", "a", "-o", "b", "--detail", "fine"],
             &["fine", "content"],
+        ),
+        (
+            &["render", "a", "-o", "b", "--detail", "0:4-1"],
+            &["0:4-1", "from the finest to the coarsest"],
         ),
         (
             &["render", "a", "-o", "b", "--background", "red"],

@@ -11,6 +11,13 @@ const ROUNDING: u8 = 1;
 
 /// The picture; `None` without a GPU, unless `SACCADE_GPU_TESTS=require`.
 fn render(place: &str, to: &Path, more: &[&str]) -> Option<RgbaImage> {
+    let (said, picture) = told(place, to, more)?;
+    assert!(said.starts_with("complete, level "), "{said}");
+    Some(picture)
+}
+
+/// What was said of the picture, and the picture.
+fn told(place: &str, to: &Path, more: &[&str]) -> Option<(String, RgbaImage)> {
     let fixed = [
         "render",
         place,
@@ -30,10 +37,9 @@ fn render(place: &str, to: &Path, more: &[&str]) -> Option<RgbaImage> {
     }
     assert!(output.status.success(), "{}", stderr(&output));
     let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    assert!(said.starts_with("complete, level "), "{said}");
     let picture = image::open(to).unwrap().into_rgba8();
     assert_eq!(picture.dimensions(), (64, 64));
-    Some(picture)
+    Some((said, picture))
 }
 
 fn largest_difference(a: &RgbaImage, b: &RgbaImage) -> u8 {
@@ -102,6 +108,40 @@ fn planes_slabs_cuts_and_the_work_of_rays_are_pictures_of_their_own() {
     assert!(alike <= ROUNDING, "{alike}");
     let alike = largest_difference(&pictures[0], &of(&["--detail", "0:full"]));
     assert!(alike <= ROUNDING, "{alike}");
+}
+
+/// The finest level that a picture asks for is one of those that its channel may be drawn from.
+#[test]
+fn levels_that_a_channel_may_be_drawn_from_bound_the_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let picture = folder.path().join("picture.png");
+    let level = |more: &[&str]| {
+        let (said, _) = told(&archive, &picture, more)?;
+        let level = said.trim().strip_prefix("complete, level ").unwrap();
+        let level = level.split(',').next().unwrap();
+        Some(level.parse::<u32>().unwrap())
+    };
+    let Some(free) = level(&[]) else {
+        return;
+    };
+    for (detail, want) in [
+        ("0-", free),
+        ("0-0", 0),
+        ("0:0-0+2", 0),
+        ("2-", free.max(2)),
+        ("0:2-3", free.max(2)),
+        ("0:2-2", 2),
+        ("0-1+1", 1),
+    ] {
+        assert_eq!(level(&["--detail", detail]), Some(want), "{detail}");
+    }
+    assert!(free < 2, "the comparison sees no difference: level {free}");
+    let nobody = ["render", &archive, "-o", "never.png", "--detail", "1:2-"];
+    let output = run(nobody);
+    assert_eq!(output.status.code(), Some(1));
+    let said = stderr(&output);
+    assert!(said.contains("there is no channel 1"), "{said}");
 }
 
 #[test]
