@@ -8,15 +8,15 @@ use egui::{CentralPanel, Key, Panel, PointerButton, Response, Sense, Ui};
 use glam::{DVec2, dvec2};
 use saccade_core::camera::Camera;
 use saccade_render::wgpu::DeviceType;
-use saccade_render::{ChannelError, Gpu, View};
+use saccade_render::{Gpu, View};
 use saccade_source::VolumeSource;
-use saccade_stream::{Again, Session, SessionError, SessionOptions, Status, Wake};
+use saccade_stream::{Again, Session, SessionError, Status, Wake};
 use web_time::Instant;
 
 use crate::acquisition::{Acquisition, AcquisitionReader};
 use crate::facts::{Facts, PageStatus, line};
 use crate::navigate::{Input, moved};
-use crate::options::{ViewOptions, set_details, show_channels};
+use crate::options::{OptionsError, ViewOptions};
 use crate::panel::{self, About, Open, Opener, Settings};
 use crate::picture::{Picture, Place};
 use crate::quality::{Cost, Events, Quality};
@@ -86,9 +86,9 @@ pub(crate) enum StartError {
     /// The volume cannot be shown.
     #[error(transparent)]
     Session(#[from] SessionError),
-    /// The channels asked for cannot be shown.
+    /// It cannot be shown as asked for.
     #[error(transparent)]
-    Channels(#[from] ChannelError),
+    Options(#[from] OptionsError),
 }
 
 impl App {
@@ -106,16 +106,10 @@ impl App {
         let gpu = gpu_of(&state);
         gpu.when_lost(asks_to_repaint(&context.egui_ctx));
         let software = is_software(&gpu);
-        let session_options = SessionOptions {
-            gpu_bytes: options.gpu_bytes,
-            limits: options.limits,
-            frames_in_flight: if software { 1 } else { 2 },
-            wake: wake.clone(),
-        };
         let home = Camera::around(source.volume());
-        let mut session = Session::new(&gpu, source, session_options)?;
-        show_channels(&mut session, options.channels.as_deref(), options.transfer)?;
-        set_details(&mut session, &options.details)?;
+        let frames_in_flight = if software { 1 } else { 2 };
+        let session = options.session(&gpu, source, frames_in_flight, wake.clone())?;
+        let selected = options.first_seen(&session);
         Ok(Self {
             session,
             state,
@@ -125,15 +119,12 @@ impl App {
             home,
             camera: options.camera.unwrap_or(home),
             settings: Settings {
-                lod_bias: 0.0,
+                lod_bias: options.lod_bias,
                 substitute: true,
-                false_colors: false,
+                false_colors: options.false_colors,
                 background: options.background,
                 shown: options.shown,
-                selected: options
-                    .channels
-                    .and_then(|c| c.first().copied())
-                    .unwrap_or(0),
+                selected,
             },
             editor: TransferEditor::default(),
             panel_open: true,
@@ -260,7 +251,7 @@ impl App {
         let view = View {
             lod_bias: self.settings.lod_bias,
             substitute: self.settings.substitute,
-            false_colors: self.settings.false_colors,
+            false_colors: self.settings.false_colors.into(),
             background: self.settings.background,
             mode: self.settings.shown.drawn_mode(),
             clip: self.settings.shown.clip(self.session.volume()),

@@ -2,7 +2,7 @@
 
 use saccade_stream::Detail;
 
-use crate::shown::ShownError;
+use crate::shown::{ShownError, each_channel};
 
 /// How finely channels are drawn: `full`, `content`, levels coarser, as in `1`, or the levels that are drawn, as in
 /// `1-4`, `1-` or `1-4+1`, which is one coarser than the view asks for; for all of them, or each as in
@@ -12,15 +12,7 @@ use crate::shown::ShownError;
 ///
 /// [`ShownError`] on anything else.
 pub fn details_from_text(text: &str) -> Result<Vec<(Option<u32>, Detail)>, ShownError> {
-    let one = |text: &str| {
-        let (channel, detail) = match text.split_once(':') {
-            Some((channel, detail)) => (Some(channel.trim().parse().ok()?), detail),
-            None => (None, text),
-        };
-        Some((channel, detail_from_text(detail.trim())?))
-    };
-    let details: Option<Vec<_>> = text.split(',').map(one).collect();
-    details.map_or_else(
+    each_channel(text, detail_from_text).map_or_else(
         || {
             let wanted = "full, content, a number of levels coarser, or the levels from the finest to the \
                           coarsest, as in 1-4 or 1-4+1; for all channels or each, as in 0:full,2:1-4+1";

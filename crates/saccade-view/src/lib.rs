@@ -46,6 +46,7 @@ mod revival;
 mod setup;
 mod shown;
 mod transfer_editor;
+mod transfer_text;
 
 #[cfg(not(target_family = "wasm"))]
 mod native;
@@ -54,13 +55,17 @@ mod web;
 
 pub use acquisition::AcquisitionReader;
 pub use detail::details_from_text;
-pub use options::{BackgroundError, ViewOptions, background_from_text, set_details, show_channels};
+pub use options::{
+    BackgroundError, OptionsError, ViewOptions, background_from_text, gpu_memory_from_text,
+    host_memory_from_text,
+};
 pub use page::{PageError, PageOptions};
 pub use plane::{Plane, plane_from_text};
 pub use shown::{
-    MOST_CUTS, OutsideError, Shown, ShownError, box_from_text, channels_from_text, heat_from_text,
-    mode_from_text, thickness_from_text,
+    MOST_CUTS, OutsideError, Shown, ShownError, box_from_text, channels_from_text,
+    false_colors_from_text, heat_from_text, isos_from_text, mode_from_text, thickness_from_text,
 };
+pub use transfer_text::{TransferError, channel_of_text, transfer_from_text};
 
 #[cfg(not(target_family = "wasm"))]
 pub use native::{SourceSpec, ViewError, run};

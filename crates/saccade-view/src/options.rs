@@ -1,28 +1,40 @@
 //! What the application opens with.
 
+use std::sync::Arc;
+
+use glam::UVec2;
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{TransferFunction, linear_from_srgb};
-use saccade_render::ChannelError;
+use saccade_core::volume::Volume;
+use saccade_render::{ChannelError, Gpu, RendererError, View};
+use saccade_source::VolumeSource;
 use saccade_stream::policy::Limits;
-use saccade_stream::{Detail, Session};
+use saccade_stream::{Detail, Session, SessionError, SessionOptions, Wake};
 
-use crate::shown::Shown;
+use crate::shown::{OutsideError, Shown, ShownError};
 
-/// What the application opens with.
+/// What the application opens with. Where something is said of channels, `None` stands for all of them, and later words
+/// go before earlier ones.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewOptions {
     /// From where; the whole volume from a corner otherwise.
     pub camera: Option<Camera>,
-    /// Colours and opacities of the first channel that is seen; following the data otherwise.
-    pub transfer: Option<TransferFunction>,
+    /// Colours and opacities of channels, `None` of the first one that is seen; those that are not told follow the data.
+    pub transfers: Vec<(Option<u32>, Option<TransferFunction>)>,
     /// Channels that are seen; the first few otherwise.
     pub channels: Option<Vec<u32>>,
-    /// How finely channels are drawn, one or all of them; as the view asks for otherwise.
+    /// How finely channels are drawn; as the view asks for otherwise.
     pub details: Vec<(Option<u32>, Detail)>,
+    /// Values of channels' surfaces, `[0, 1]` of the value type's range; between the ends of the opacities otherwise.
+    pub isos: Vec<(Option<u32>, f32)>,
     /// Which part of the volume, and how.
     pub shown: Shown,
     /// Behind everything, linear RGB in `[0, 1]`.
     pub background: [f32; 3],
+    /// Levels coarser (above 0) or finer than one voxel a pixel.
+    pub lod_bias: f32,
+    /// Whether what is drawn from other levels is tinted.
+    pub false_colors: bool,
     /// Whether there is anything but the picture.
     pub ui: bool,
     /// Ceiling for GPU memory \[bytes\].
@@ -35,11 +47,14 @@ impl Default for ViewOptions {
     fn default() -> Self {
         Self {
             camera: None,
-            transfer: None,
+            transfers: Vec::new(),
             channels: None,
             details: Vec::new(),
+            isos: Vec::new(),
             shown: Shown::default(),
             background: [0.0; 3],
+            lod_bias: 0.0,
+            false_colors: false,
             ui: true,
             gpu_bytes: 512 << 20,
             limits: Limits::default(),
@@ -47,51 +62,192 @@ impl Default for ViewOptions {
     }
 }
 
-/// Shows these channels of a session and no others, if any are named; the first of them with these
-/// colours and opacities, if any are.
-///
-/// # Errors
-///
-/// [`ChannelError`] for channels that the volume does not have, or too many.
-pub fn show_channels(
-    session: &mut Session,
-    channels: Option<&[u32]>,
-    transfer: Option<TransferFunction>,
-) -> Result<(), ChannelError> {
-    if let Some(channels) = channels {
-        // Hidden first: never are too many seen on the way.
-        for (index, channel) in (0..).zip(session.channels().to_vec()) {
-            if channel.visible && !channels.contains(&index) {
-                session.set_visible(index, false)?;
-            }
-        }
-        for &channel in channels {
-            session.set_visible(channel, true)?;
-        }
-    }
-    if let Some(transfer) = transfer {
-        let first = channels.and_then(|channels| channels.first());
-        session.set_transfer_function(first.copied().unwrap_or(0), transfer)?;
-    }
-    Ok(())
+/// Why a volume cannot be shown so.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OptionsError {
+    /// Nothing of it would be seen.
+    #[error(transparent)]
+    Outside(#[from] OutsideError),
+    /// It has other channels.
+    #[error(transparent)]
+    Channels(#[from] ChannelError),
+    /// It cannot be shown at all.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+    /// There is no room for as much as a picture needs.
+    #[error(
+        "{given} MiB of GPU memory are too few for this volume; allow {needed} or more (--gpu-memory {needed}, \
+         or gpu-memory={needed} in the page's address)"
+    )]
+    GpuMemory {
+        /// The ceiling \[MiB\].
+        given: u64,
+        /// One that would do \[MiB\].
+        needed: u64,
+    },
 }
 
-/// Draws channels so finely, later wishes after earlier ones; `None` stands for all of them.
+impl ViewOptions {
+    /// Refuses what a volume does not have, and what shows nothing of it.
+    ///
+    /// # Errors
+    ///
+    /// [`OptionsError`] says what there is.
+    pub fn check(&self, volume: &Volume) -> Result<(), OptionsError> {
+        self.shown.check(volume)?;
+        let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
+        let seen = self.channels.iter().flatten().map(|channel| Some(*channel));
+        let named = seen
+            .chain(self.transfers.iter().map(|(channel, _)| *channel))
+            .chain(self.details.iter().map(|(channel, _)| *channel))
+            .chain(self.isos.iter().map(|(channel, _)| *channel));
+        match named.flatten().find(|channel| *channel >= channels) {
+            Some(channel) => Err(ChannelError::NoSuchChannel { channel, channels }.into()),
+            None => Ok(()),
+        }
+    }
+
+    /// A session of a volume that is shown so.
+    ///
+    /// # Errors
+    ///
+    /// [`OptionsError`] for what the volume does not have, and where there is too little memory.
+    pub fn session(
+        &self,
+        gpu: &Gpu,
+        source: Arc<dyn VolumeSource>,
+        frames_in_flight: usize,
+        wake: Wake,
+    ) -> Result<Session, OptionsError> {
+        let options = SessionOptions {
+            gpu_bytes: self.gpu_bytes,
+            limits: self.limits.clone(),
+            frames_in_flight,
+            wake,
+        };
+        let session = Session::new(gpu, source, options);
+        let mut session = session.map_err(|error| too_little(&error).unwrap_or(error.into()))?;
+        self.show_channels(&mut session)?;
+        Ok(session)
+    }
+
+    /// One picture of a volume.
+    pub fn view(&self, volume: &Volume, size: UVec2) -> View {
+        let camera = self.camera.unwrap_or_else(|| Camera::around(volume));
+        View {
+            background: self.background,
+            mode: self.shown.drawn_mode(),
+            clip: self.shown.clip(volume),
+            heat: self.shown.heat,
+            lod_bias: self.lod_bias,
+            false_colors: self.false_colors.into(),
+            ..View::new(camera, size)
+        }
+    }
+
+    fn show_channels(&self, session: &mut Session) -> Result<(), ChannelError> {
+        if let Some(channels) = &self.channels {
+            // Hidden first: never are too many seen on the way.
+            for (index, channel) in (0..).zip(session.channels().to_vec()) {
+                if channel.visible && !channels.contains(&index) {
+                    session.set_visible(index, false)?;
+                }
+            }
+            for &channel in channels {
+                session.set_visible(channel, true)?;
+            }
+        }
+        let first = self.first_seen(session);
+        for (channel, transfer) in &self.transfers {
+            let channel = channel.unwrap_or(first);
+            match transfer {
+                Some(transfer) => session.set_transfer_function(channel, transfer.clone())?,
+                None => session.set_automatic_transfer_function(channel)?,
+            }
+        }
+        let all = u32::try_from(session.channels().len()).unwrap_or(u32::MAX);
+        let those = |channel: Option<u32>| match channel {
+            Some(channel) => channel..channel.saturating_add(1),
+            None => 0..all,
+        };
+        for (channel, detail) in &self.details {
+            for channel in those(*channel) {
+                session.set_detail(channel, detail.clone())?;
+            }
+        }
+        for (channel, iso) in &self.isos {
+            for channel in those(*channel) {
+                session.set_iso(channel, Some(*iso))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The channel that is named first, or the first that is seen.
+    pub(crate) fn first_seen(&self, session: &Session) -> u32 {
+        let named = self.channels.iter().flatten().next().copied();
+        let seen = || (0..).zip(session.channels()).find(|(_, c)| c.visible);
+        let first = named.or_else(|| seen().map(|(index, _)| index));
+        first.unwrap_or(0)
+    }
+}
+
+/// What would do, where memory is too little.
+fn too_little(error: &SessionError) -> Option<OptionsError> {
+    match error {
+        SessionError::Renderer {
+            source: RendererError::Ceiling { ceiling, needed },
+            ..
+        } => Some(OptionsError::GpuMemory {
+            given: ceiling >> 20,
+            needed: needed.div_ceil(1 << 20),
+        }),
+        _ => None,
+    }
+}
+
+/// Ceiling for GPU memory from whole MiB \[bytes\].
 ///
 /// # Errors
 ///
-/// [`ChannelError`] for channels that the volume does not have.
-pub fn set_details(
-    session: &mut Session,
-    details: &[(Option<u32>, Detail)],
-) -> Result<(), ChannelError> {
-    let all = u32::try_from(session.channels().len()).unwrap_or(u32::MAX);
-    for (channel, detail) in details {
-        for channel in channel.map_or(0..all, |channel| channel..channel.saturating_add(1)) {
-            session.set_detail(channel, detail.clone())?;
-        }
+/// [`ShownError`] on anything else.
+pub fn gpu_memory_from_text(text: &str) -> Result<u64, ShownError> {
+    memory_from_text(
+        text,
+        1,
+        u32::MAX,
+        "ceiling for GPU memory",
+        "whole MiB from 1 on, as in 512",
+    )
+}
+
+/// Ceiling for chunks in main memory from whole MiB \[bytes\].
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else, less than anything can be shown with, and, in a browser, more than pages have.
+pub fn host_memory_from_text(text: &str) -> Result<u64, ShownError> {
+    let (most, wanted) = if cfg!(target_family = "wasm") {
+        (2048, "whole MiB from 16 to 2048, as in 512")
+    } else {
+        (u32::MAX, "whole MiB from 16 on, as in 512")
+    };
+    memory_from_text(text, 16, most, "ceiling for main memory", wanted)
+}
+
+fn memory_from_text(
+    text: &str,
+    least: u32,
+    most: u32,
+    what: &'static str,
+    wanted: &'static str,
+) -> Result<u64, ShownError> {
+    let mib = text.trim().parse().ok();
+    match mib.filter(|mib: &u32| (least..=most).contains(mib)) {
+        Some(mib) => Ok(u64::from(mib) << 20),
+        None => ShownError::of(text, what, wanted),
     }
-    Ok(())
 }
 
 /// Text that names no colour.
@@ -136,5 +292,69 @@ mod tests {
         for bad in ["", "white", "#fff", "#12345g", "#1234567", "+1+2+3", "日本"] {
             assert!(background_from_text(bad).is_err(), "{bad:?}");
         }
+    }
+
+    #[test]
+    fn memory_is_in_whole_mebibytes() {
+        assert_eq!(gpu_memory_from_text("4"), Ok(4 << 20));
+        assert_eq!(host_memory_from_text(" 16 "), Ok(16 << 20));
+        assert_eq!(gpu_memory_from_text("8192"), Ok(8192 << 20));
+        for bad in ["", "0", "-1", "1.5", "2GB", "9999999999"] {
+            let told = gpu_memory_from_text(bad).unwrap_err().to_string();
+            assert!(
+                told.contains("GPU memory") && told.contains("MiB"),
+                "{told}"
+            );
+            assert!(host_memory_from_text(bad).is_err(), "{bad:?}");
+        }
+        let told = host_memory_from_text("15").unwrap_err().to_string();
+        assert!(
+            told.contains("\"15\"") && told.contains("from 16"),
+            "{told}"
+        );
+    }
+
+    #[test]
+    fn what_the_volume_does_not_have_is_refused() {
+        let size = glam::UVec3::new(90, 80, 70);
+        let mut volume = Volume::new("v", size, glam::DVec3::ONE).unwrap();
+        volume.channels = vec!["a".to_owned(), "b".to_owned()];
+        let check = |options: ViewOptions| options.check(&volume).map_err(|e| e.to_string());
+        for channel in [0, 1, 2, 9] {
+            let with = [
+                ViewOptions {
+                    channels: Some(vec![0, channel]),
+                    ..ViewOptions::default()
+                },
+                ViewOptions {
+                    transfers: vec![(None, None), (Some(channel), None)],
+                    ..ViewOptions::default()
+                },
+                ViewOptions {
+                    details: vec![(Some(channel), Detail::Full)],
+                    ..ViewOptions::default()
+                },
+                ViewOptions {
+                    isos: vec![(Some(channel), 0.5)],
+                    ..ViewOptions::default()
+                },
+            ];
+            for options in with {
+                let told = check(options);
+                match channel {
+                    0 | 1 => assert_eq!(told, Ok(())),
+                    _ => assert!(told.unwrap_err().contains("the volume has 2")),
+                }
+            }
+        }
+        let outside = Shown {
+            slice: Some(crate::plane::Plane::across(2, 70.0)),
+            ..Shown::default()
+        };
+        let told = check(ViewOptions {
+            shown: outside,
+            ..ViewOptions::default()
+        });
+        assert!(told.unwrap_err().contains("z=70"));
     }
 }

@@ -1,16 +1,18 @@
 //! The part of a web address after the question mark.
 
 use saccade_core::camera::{Camera, ParseCameraError};
-use saccade_core::transfer::TransferFunction;
 use saccade_source::objects::{Location, LocationError};
 
 use crate::detail::details_from_text;
-use crate::options::{BackgroundError, ViewOptions, background_from_text};
+use crate::options::{
+    BackgroundError, ViewOptions, background_from_text, gpu_memory_from_text, host_memory_from_text,
+};
 use crate::plane::plane_from_text;
 use crate::shown::{
-    MOST_CUTS, ShownError, box_from_text, channels_from_text, heat_from_text, mode_from_text,
-    thickness_from_text,
+    MOST_CUTS, ShownError, box_from_text, channels_from_text, false_colors_from_text,
+    heat_from_text, isos_from_text, mode_from_text, thickness_from_text,
 };
+use crate::transfer_text::{TransferError, channel_of_text, transfer_from_text};
 
 /// What a page's address asks for.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -33,7 +35,8 @@ pub enum PageError {
     /// `background=`.
     #[error(transparent)]
     Background(#[from] BackgroundError),
-    /// `channels=`, `detail=`, `mode=`, `clip=`, `slice=`, `slab=`, `cut=` or `heat=`.
+    /// `channels=`, `detail=`, `mode=`, `iso=`, `clip=`, `slice=`, `slab=`, `cut=`, `heat=`,
+    /// `false-colors=`, `gpu-memory=` or `host-memory=`.
     #[error(transparent)]
     Shown(#[from] ShownError),
     /// `source=`.
@@ -43,11 +46,11 @@ pub enum PageError {
     #[error("source= names an image and volume= one of the server's volumes; give one of them")]
     Both,
     /// `transfer=`.
-    #[error("transfer= is no transfer function as JSON")]
+    #[error("nothing can be shown with transfer=")]
     Transfer {
         /// What is wrong with it.
         #[from]
-        source: serde_json::Error,
+        source: TransferError,
     },
     /// `cut=` too often.
     #[error("{most} planes can cut, and the address has more (cut=)")]
@@ -79,10 +82,16 @@ impl PageOptions {
                 "source" => page.source = Some(value),
                 "camera" => page.view.camera = Some(value.parse::<Camera>()?),
                 "transfer" => {
-                    page.view.transfer = Some(serde_json::from_str::<TransferFunction>(&value)?);
+                    let (channel, text) = channel_of_text(&value);
+                    let transfer = match text {
+                        "auto" => None,
+                        json => Some(transfer_from_text(json)?),
+                    };
+                    page.view.transfers.push((channel, transfer));
                 }
                 "channels" => page.view.channels = Some(channels_from_text(&value)?),
                 "mode" => page.view.shown.mode = mode_from_text(&value)?,
+                "iso" => page.view.isos = isos_from_text(&value)?,
                 "clip" => page.view.shown.within = Some(box_from_text(&value)?),
                 "detail" => page.view.details = details_from_text(&value)?,
                 "slice" => page.view.shown.slice = Some(plane_from_text(&value)?),
@@ -93,7 +102,10 @@ impl PageOptions {
                     fits.then_some(()).ok_or(PageError::TooManyCuts { most })?;
                 }
                 "heat" => page.view.shown.heat = Some(heat_from_text(&value)?),
+                "false-colors" => page.view.false_colors = false_colors_from_text(&value)?,
                 "background" => page.view.background = background_from_text(&value)?,
+                "gpu-memory" => page.view.gpu_bytes = gpu_memory_from_text(&value)?,
+                "host-memory" => page.view.limits.host_bytes = host_memory_from_text(&value)?,
                 "ui" => page.view.ui = on_or_off(value)?,
                 _ => {}
             }
@@ -160,6 +172,12 @@ mod tests {
             ("volume", "my brain"),
             ("camera", "30,25,1000,1,2,3"),
             ("transfer", &json),
+            ("transfer", &format!("2:{json}")),
+            ("transfer", "0:auto"),
+            ("iso", "0.5,2:0.25"),
+            ("false-colors", "residency"),
+            ("gpu-memory", "64"),
+            ("host-memory", "128"),
             ("background", "#ffffff"),
             ("channels", "2,0"),
             ("mode", "surface"),
@@ -175,7 +193,18 @@ mod tests {
         let PageOptions { volume, view, .. } = page.unwrap();
         assert_eq!(volume.as_deref(), Some("my brain"));
         assert_eq!(view.camera.unwrap().distance_nm, 1000.0);
-        assert_eq!(view.transfer, Some(transfer));
+        let transfers = [
+            (None, Some(transfer.clone())),
+            (Some(2), Some(transfer)),
+            (Some(0), None),
+        ];
+        assert_eq!(view.transfers, transfers);
+        assert!(view.false_colors);
+        assert_eq!(view.isos, [(None, 0.5), (Some(2), 0.25)]);
+        assert_eq!(
+            (view.gpu_bytes, view.limits.host_bytes),
+            (64 << 20, 128 << 20)
+        );
         assert_eq!(view.background, [1.0; 3]);
         assert_eq!(view.channels, Some(vec![2, 0]));
         let clip = [glam::DVec3::ZERO, glam::DVec3::new(9.0, 8.0, 7.0)];
@@ -237,6 +266,11 @@ mod tests {
         for (name, value) in [
             ("camera", "1,2"),
             ("transfer", "{}"),
+            ("transfer", "1:file.json"),
+            ("iso", "0:2"),
+            ("false-colors", "many"),
+            ("gpu-memory", "much"),
+            ("host-memory", "2"),
             ("background", "sky"),
             ("channels", "red"),
             ("mode", "dreamy"),
@@ -253,6 +287,10 @@ mod tests {
             let named = match name {
                 "slice" | "cut" => "plane",
                 "slab" => "thickness",
+                "iso" => "surface",
+                "false-colors" => "false colours",
+                "gpu-memory" => "GPU memory",
+                "host-memory" => "main memory",
                 "heat" => "work of rays",
                 name => name,
             };

@@ -1,13 +1,13 @@
 //! The panel beside the picture and the line below it.
 
+mod channel;
+
 use egui::{Color32, RichText, Slider, Ui};
 use saccade_core::camera::Camera;
-use saccade_core::transfer::{ColorMap, TransferFunction};
-use saccade_core::volume::{Polarity, Volume};
+use saccade_core::volume::Volume;
 use saccade_render::{Heat, Mode, Work};
-use saccade_stream::{Detail, Session};
+use saccade_stream::Session;
 
-use crate::detail;
 use crate::facts::{Piece, Tone};
 use crate::plane::{AXES, Plane};
 use crate::shown::{MOST_CUTS, Shown, WORKS};
@@ -92,8 +92,8 @@ pub(crate) fn show(
                 channels(ui, session, &mut settings.selected);
                 ui.separator();
             }
-            transfer(ui, session, editor, settings.selected);
-            detail(ui, session, settings.selected);
+            channel::transfer(ui, session, editor, settings.selected);
+            channel::detail(ui, session, settings.selected);
             ui.separator();
             let volume = session.volume().clone();
             shown(ui, session, settings, &volume, about.camera);
@@ -155,47 +155,6 @@ fn channels(ui: &mut Ui, session: &mut Session, selected: &mut u32) {
     if let Some(error) = refused {
         // Said for as long as the pointer stays.
         ui.colored_label(ui.visuals().error_fg_color, error.to_string());
-    }
-}
-
-fn transfer(ui: &mut Ui, session: &mut Session, editor: &mut TransferEditor, selected: u32) {
-    let Some(channel) = session.channels().get(selected as usize).cloned() else {
-        return;
-    };
-    let mut transfer = channel.transfer;
-    let mut changed = transfer_editor::show(ui, editor, &mut transfer, &channel.histogram);
-    changed |= polarity(ui, &mut transfer);
-    egui::ComboBox::from_label("Colours")
-        .selected_text(map_name(transfer.color_map))
-        .show_ui(ui, |ui| {
-            for map in ColorMap::ALL {
-                let value = &mut transfer.color_map;
-                changed |= ui.selectable_value(value, map, map_name(map)).changed();
-            }
-        });
-    let span = transfer_editor::span(&channel.histogram);
-    let [low, high] = &mut transfer.window;
-    changed |= ui
-        .add(Slider::new(low, 0.0..=span).text("First colour at"))
-        .changed();
-    changed |= ui
-        .add(Slider::new(high, 0.0..=span).text("Last colour at"))
-        .changed();
-    let done = if changed {
-        session.set_transfer_function(selected, transfer)
-    } else {
-        Ok(())
-    };
-    let button = ui.add_enabled(!channel.automatic, egui::Button::new("Follow the data"));
-    let follow = button
-        .on_hover_text("Colours and opacities from the histogram, while data arrive")
-        .clicked();
-    let followed = match follow {
-        true => session.set_automatic_transfer_function(selected),
-        false => Ok(()),
-    };
-    if let Err(error) = done.and(followed) {
-        log::error!("{error}");
     }
 }
 
@@ -261,8 +220,12 @@ fn shown(
             let Some(plane) = cut else { continue };
             let keeps = ui
                 .horizontal(|ui| {
-                    along_normal(ui, plane, volume);
-                    !ui.button("✖")
+                    along_normal(ui, plane, volume, "nm");
+                    let flip = ui.button("Flip");
+                    if flip.on_hover_text("Cut away the other side").clicked() {
+                        *plane = plane.flipped();
+                    }
+                    !ui.button("×")
                         .on_hover_text("Take this plane away")
                         .clicked()
                 })
@@ -324,17 +287,18 @@ fn slice(ui: &mut Ui, shown: &mut Shown, volume: &Volume, camera: &Camera) {
                 *plane = Plane::across(axis, at);
             }
         }
-        None => along_normal(ui, plane, volume),
+        None => along_normal(ui, plane, volume, "nm from the middle"),
     }
     let thickest = 2.0 * plane.reach(volume);
     ui.add(Slider::new(&mut shown.slab_nm, 0.0..=thickest).text("nm thick"));
 }
 
 /// Moves a plane along its normal.
-fn along_normal(ui: &mut Ui, plane: &mut Plane, volume: &Volume) {
+fn along_normal(ui: &mut Ui, plane: &mut Plane, volume: &Volume, unit: &str) {
     let (mut offset, reach) = (plane.offset(volume), plane.reach(volume));
-    let slider = Slider::new(&mut offset, -reach..=reach).text("nm from the middle");
-    if ui.add(slider).changed() {
+    let slider = ui.add(Slider::new(&mut offset, -reach..=reach).text(unit));
+    let slider = slider.on_hover_text("How far from the middle of the volume, along its normal");
+    if slider.changed() {
         *plane = plane.at_offset(offset, volume);
     }
 }
@@ -379,80 +343,6 @@ fn work_name(work: Work) -> &'static str {
         Work::Nodes => "octree nodes a ray",
         Work::Samples => "samples a ray",
     }
-}
-
-/// How finely a channel is drawn.
-fn detail(ui: &mut Ui, session: &mut Session, selected: u32) {
-    let Some(channel) = session.channels().get(selected as usize) else {
-        return;
-    };
-    let (before, needed) = (channel.detail.clone(), channel.finest_needed);
-    let last = session.volume().levels.len().saturating_sub(1);
-    let last = u32::try_from(last).unwrap_or(u32::MAX);
-    let bounds = detail::bounds(&before, last);
-    let coarser = |coarser| detail::chosen(bounds, bounds, last, coarser);
-    let mut detail = before.clone();
-    let by_content = before == Detail::ByContent;
-    let now = match detail::coarser(&before) {
-        _ if by_content && needed > 0 => format!("by content: from level {needed}"),
-        _ if by_content => "by content".to_owned(),
-        0 => "as fine as the view".to_owned(),
-        1 => "1 level coarser".to_owned(),
-        levels => format!("{levels} levels coarser"),
-    };
-    egui::ComboBox::from_label("Detail")
-        .selected_text(now)
-        .show_ui(ui, |ui| {
-            for (choice, text) in [
-                (coarser(0), "as fine as the view"),
-                (Detail::ByContent, "by content"),
-                (coarser(1), "1 level coarser"),
-                (coarser(2), "2 levels coarser"),
-                (coarser(3), "3 levels coarser"),
-            ] {
-                ui.selectable_value(&mut detail, choice, text);
-            }
-        })
-        .response
-        .on_hover_text(
-            "Coarser channels leave memory to others. By content: levels that differ by less than a \
-             hundredth from the next coarser one are left out.",
-        );
-    // By content, levels are found and not chosen.
-    if last > 0 && !by_content {
-        let mut moved = bounds;
-        let [finest, coarsest] = &mut moved;
-        let finest = ui.add(Slider::new(finest, 0..=last).text("finest level"));
-        finest.on_hover_text("No finer one is drawn, however near it is; 0 is the finest there is");
-        let coarsest = ui.add(Slider::new(coarsest, 0..=last).text("coarsest level"));
-        coarsest.on_hover_text("No coarser one is drawn, however far it is");
-        if moved != bounds {
-            detail = detail::chosen(moved, bounds, last, detail::coarser(&before));
-        }
-    }
-    if detail != before
-        && let Err(error) = session.set_detail(selected, detail)
-    {
-        log::error!("{error}");
-    }
-}
-
-fn polarity(ui: &mut Ui, transfer: &mut TransferFunction) -> bool {
-    let before = transfer.polarity;
-    ui.horizontal(|ui| {
-        ui.label("Structures are");
-        ui.selectable_value(&mut transfer.polarity, Polarity::Dark, "dark");
-        ui.selectable_value(&mut transfer.polarity, Polarity::Bright, "bright");
-    });
-    transfer.polarity != before
-}
-
-/// As people see it in a menu.
-fn map_name(map: ColorMap) -> String {
-    let name = map.to_string();
-    let mut letters = name.chars();
-    let first = letters.next().map(|first| first.to_ascii_uppercase());
-    first.into_iter().chain(letters).collect()
 }
 
 fn picture(ui: &mut Ui, settings: &mut Settings) {

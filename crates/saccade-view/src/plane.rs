@@ -42,6 +42,12 @@ impl Plane {
         }
     }
 
+    /// The same plane, whose normal points to the other side.
+    pub(crate) fn flipped(self) -> Self {
+        let normal = -self.normal;
+        Self { normal, ..self }
+    }
+
     /// How far it is from the middle of a volume, along its normal \[nm\].
     pub(crate) fn offset(&self, volume: &Volume) -> f64 {
         let from_middle = self.point * volume.voxel_nm - volume.size_nm() / 2.0;
@@ -174,6 +180,21 @@ mod tests {
             assert!((moved.offset(&volume) - offset).abs() < 1e-9);
             assert_eq!(moved.normal, plane.normal);
         }
+    }
+
+    #[test]
+    fn a_flipped_plane_is_where_it_was_and_keeps_the_other_side() {
+        let volume = volume();
+        let plane = Plane {
+            normal: DVec3::new(0.0, 3.0, 4.0),
+            point: DVec3::new(45.0, 50.0, 35.0),
+        };
+        let flipped = plane.flipped();
+        assert_eq!(flipped.point, plane.point);
+        assert_eq!(flipped.offset(&volume), -plane.offset(&volume));
+        let [kept, cut] = [plane, flipped].map(|plane| plane.half_space(&volume));
+        assert_eq!((kept.point, kept.normal), (cut.point, -cut.normal));
+        assert_eq!(flipped.flipped(), plane);
     }
 
     #[test]

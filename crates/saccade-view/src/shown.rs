@@ -72,6 +72,19 @@ pub fn mode_from_text(text: &str) -> Result<Mode, ShownError> {
     }
 }
 
+/// Whether what is not drawn from its own level is tinted: `none` or `residency`.
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else.
+pub fn false_colors_from_text(text: &str) -> Result<bool, ShownError> {
+    match text {
+        "none" => Ok(false),
+        "residency" => Ok(true),
+        _ => ShownError::of(text, "false colours", "none or residency"),
+    }
+}
+
 /// Two corners from six numbers with commas: x, y, z of one and of the other \[level-0 voxels\].
 ///
 /// # Errors
@@ -131,6 +144,34 @@ pub fn heat_from_text(text: &str) -> Result<Heat, ShownError> {
         },
         Ok,
     )
+}
+
+/// Values of channels' surfaces, from 0 to 1, as in `0.4`; for all of them, or each as in `0:0.4,2:0.6`.
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else.
+pub fn isos_from_text(text: &str) -> Result<Vec<(Option<u32>, f32)>, ShownError> {
+    let value = |text: &str| text.parse().ok().filter(|iso| (0.0..=1.0).contains(iso));
+    each_channel(text, value).map_or_else(
+        || {
+            let wanted = "numbers from 0 to 1, for all channels or each, as in 0:0.4,2:0.6";
+            ShownError::of(text, "value of a surface", wanted)
+        },
+        Ok,
+    )
+}
+
+/// With commas, what is said of all channels, or of each as in `2:WORD`.
+pub(crate) fn each_channel<T>(
+    text: &str,
+    word: impl Fn(&str) -> Option<T>,
+) -> Option<Vec<(Option<u32>, T)>> {
+    let one = |text: &str| match text.split_once(':') {
+        Some((channel, text)) => Some((Some(channel.trim().parse().ok()?), word(text.trim())?)),
+        None => Some((None, word(text.trim())?)),
+    };
+    text.split(',').map(one).collect()
 }
 
 /// A length that is not negative \[nm\].
@@ -301,11 +342,24 @@ mod tests {
         ] {
             assert!(box_from_text(bad).is_err(), "{bad:?}");
         }
+        assert_eq!(false_colors_from_text("none"), Ok(false));
+        assert_eq!(false_colors_from_text("residency"), Ok(true));
+        for bad in ["", "on", "Residency"] {
+            assert!(false_colors_from_text(bad).is_err(), "{bad:?}");
+        }
         let heat = |of, full| Ok(Heat { of, full });
         assert_eq!(heat_from_text("nodes=40"), heat(Work::Nodes, 40.0));
         assert_eq!(heat_from_text("samples"), heat(Work::Samples, 512.0));
         for bad in ["", "node", "nodes=", "nodes=0", "nodes=NaN", "nodes=-1"] {
             assert!(heat_from_text(bad).is_err(), "{bad:?}");
+        }
+        assert_eq!(isos_from_text("0.4"), Ok(vec![(None, 0.4)]));
+        let each = vec![(None, 0.0), (Some(2), 1.0)];
+        assert_eq!(isos_from_text("0, 2:1"), Ok(each));
+        for bad in [
+            "", "1.1", "-0.1", "NaN", "2:", ":0.5", "a:0.5", "1:2:0.5", "0.5,",
+        ] {
+            assert!(isos_from_text(bad).is_err(), "{bad:?}");
         }
         assert_eq!(thickness_from_text("40.5"), Ok(40.5));
         for bad in ["", "-1", "NaN", "inf", "4nm"] {

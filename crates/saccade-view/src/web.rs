@@ -84,8 +84,8 @@ async fn run(canvas_id: &str) -> Result<(), String> {
         Some(image) => open_image(&image).await?,
         None => open_volume(&origin, page.volume).await?,
     };
-    let seen = page.view.shown.check(opened.source.volume());
-    seen.map_err(|error| format!("The page's address asks for what is not there: {error}."))?;
+    let there = page.view.check(opened.source.volume());
+    there.map_err(|error| format!("The page's address asks for what is not there: {error}."))?;
 
     let (tell, losses) = mpsc::unbounded();
     let surroundings = Surroundings {

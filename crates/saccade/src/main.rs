@@ -12,6 +12,7 @@ mod arguments;
 mod commands;
 mod folders;
 mod interrupt;
+mod looks;
 mod open;
 mod progress;
 mod report;
@@ -35,7 +36,7 @@ enum Command {
     Simulate(commands::simulate::Simulate),
     Ingest(commands::ingest::Ingest),
     Serve(commands::serve::Serve),
-    View(commands::view::View),
+    View(Box<commands::view::View>),
     Render(Box<commands::render::Render>),
     Export(commands::export::Export),
     Check(commands::check::Check),

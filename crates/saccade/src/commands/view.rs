@@ -2,10 +2,10 @@
 
 use anyhow::Result;
 use clap::Args;
-use saccade_core::camera::Camera;
-use saccade_view::{SourceSpec, ViewOptions, background_from_text, run};
+use saccade_view::{SourceSpec, run};
 
 use crate::arguments::CatalogArgument;
+use crate::looks::Looks;
 use crate::open::{Opened, Place};
 use crate::stitching::Stitching;
 
@@ -24,18 +24,8 @@ pub(crate) struct View {
     #[arg(long)]
     volume: Option<String>,
 
-    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres [default: the whole
-    /// volume]
-    #[arg(long, allow_hyphen_values = true)]
-    camera: Option<Camera>,
-
-    /// Behind everything, as #rrggbb
-    #[arg(long, value_name = "COLOUR", value_parser = background_from_text, default_value = "#000000")]
-    background: [f32; 3],
-
-    /// Ceiling for GPU memory [MiB]
-    #[arg(long, value_name = "MIB", default_value_t = 512)]
-    gpu_memory: u32,
+    #[command(flatten)]
+    looks: Looks,
 
     #[command(flatten)]
     stitching: Stitching,
@@ -43,6 +33,7 @@ pub(crate) struct View {
 
 impl View {
     pub(crate) async fn run(self) -> Result<()> {
+        let options = self.looks.options()?;
         let opened = self
             .place
             .open(&self.catalog, self.volume.as_deref(), &self.stitching)
@@ -51,12 +42,8 @@ impl View {
             source,
             acquisition,
         } = opened;
-        let options = ViewOptions {
-            camera: self.camera,
-            background: self.background,
-            gpu_bytes: u64::from(self.gpu_memory) << 20,
-            ..ViewOptions::default()
-        };
+        // Before there is a window.
+        options.check(source.volume())?;
         Ok(run(
             SourceSpec::Open {
                 source,

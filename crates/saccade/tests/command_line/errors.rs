@@ -454,7 +454,7 @@ fn no_gpu() {
 
 #[test]
 fn words_that_make_no_sense() {
-    let cases: [(&[&str], &[&str]); 19] = [
+    let cases: [(&[&str], &[&str]); 23] = [
         (
             &["simulate", "a", "--input", "b", "--extent", "9,9,9"],
             &["--extent", "cannot be used with", "--input"],
@@ -500,6 +500,19 @@ fn words_that_make_no_sense() {
         (
             &["render", "a", "-o", "b", "--detail", "0:4-1"],
             &["0:4-1", "from the finest to the coarsest"],
+        ),
+        (
+            &["view", "a", "--detail", "0:4-1"],
+            &["0:4-1", "from the finest to the coarsest"],
+        ),
+        (&["view", "a", "--slab", "40"], &["--slice"]),
+        (
+            &["render", "a", "-o", "b", "--host-memory", "15"],
+            &["15", "whole MiB from 16 on"],
+        ),
+        (
+            &["view", "a", "--gpu-memory", "0"],
+            &["whole MiB from 1 on"],
         ),
         (
             &["render", "a", "-o", "b", "--background", "red"],
@@ -747,7 +760,67 @@ fn what_is_asked_for_outside_the_volume() {
         assert_failed(&render(&["--transfer", &json]), 1, &[part]);
     }
     assert_failed(&render(&["--iso", "2"]), 2, &["0 to 1"]);
+    for more in [
+        &["--iso", "1:0.5"][..],
+        &["--transfer", "1:auto"],
+        &["--channels", "1"],
+    ] {
+        assert_failed(&render(more), 1, &["there is no channel 1", "has 1"]);
+    }
+    let five = ["--cut", "x=1"].repeat(5);
+    assert_failed(&render(&five), 1, &["4 planes", "--cut fewer times"]);
     assert!(!picture.exists());
+}
+
+/// What a window is asked for is looked at before there is one.
+#[test]
+fn a_window_without_a_display() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let view = |more: &[&str]| run(["view", &archive].iter().chain(more));
+    let transfer = r##"0:{"polarity": "dark", "color_map": "#ff8000", "window": [0.1, 0.8],
+        "opacity_length_nm": 200, "opacity": [{"value": 0.3, "opacity": 0.9}]}"##;
+    let all = [
+        "--channels",
+        "0",
+        "--mode",
+        "maximum",
+        "--slice",
+        "z=6",
+        "--slab",
+        "80",
+        "--clip",
+        "0,0,0,90,90,9",
+        "--cut",
+        "x=9",
+        "--heat",
+        "nodes",
+        "--detail",
+        "0:1-2",
+        "--iso",
+        "0.4",
+        "--transfer",
+        transfer,
+        "--host-memory",
+        "64",
+        "--camera",
+        "30,20,9000,1200,1000,240",
+    ];
+    assert_failed(&view(&all), 1, &["is there a display"]);
+    for (more, parts) in [
+        (&["--slice", "z=12"][..], &["z=12", "from 0 to 11"][..]),
+        (&["--detail", "3:1-2"], &["there is no channel 3"]),
+        (
+            &["--transfer", "0:nowhere.json"],
+            &["cannot read", "nowhere.json"],
+        ),
+        (
+            &["--transfer", "0:{}"],
+            &["no transfer function", "--transfer"],
+        ),
+    ] {
+        assert_failed(&view(more), 1, parts);
+    }
 }
 
 #[test]

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use image::RgbaImage;
+use serde_json::json;
 
 use super::{Running, archive, run, saccade, stderr};
 
@@ -142,6 +143,184 @@ fn levels_that_a_channel_may_be_drawn_from_bound_the_picture() {
     assert_eq!(output.status.code(), Some(1));
     let said = stderr(&output);
     assert!(said.contains("there is no channel 1"), "{said}");
+}
+
+/// An OME-Zarr image of noise: two channels with more bricks than fit 4 MiB, and three levels.
+fn noise(folder: &Path) -> String {
+    let image = folder.join("noise.zarr");
+    let axis = |name: &str| json!({"name": name, "type": "space", "unit": "nanometer"});
+    let mut datasets = Vec::new();
+    for level in 0..3_u32 {
+        let (edge, depth) = (256 >> level, 64 >> level);
+        let name = level.to_string();
+        let nm = f64::from(4 << level);
+        let scale = json!([{"type": "scale", "scale": [1, nm, nm, nm]}]);
+        datasets.push(json!({"path": name, "coordinateTransformations": scale}));
+        let array = json!({"zarr_format": 3, "node_type": "array", "shape": [2, depth, edge, edge],
+            "data_type": "uint8", "fill_value": 0,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [1, depth, edge, edge]}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "codecs": [{"name": "bytes"}]});
+        std::fs::create_dir_all(image.join(&name)).unwrap();
+        std::fs::write(image.join(&name).join("zarr.json"), array.to_string()).unwrap();
+        for channel in 0..2_u32 {
+            let voxels: Vec<u8> = (0..edge * edge * depth)
+                .map(|n: u32| {
+                    u8::try_from((n.wrapping_mul(2_654_435_761) >> 24) % 200 + 20 + channel)
+                        .unwrap()
+                })
+                .collect();
+            let chunk = image.join(format!("{name}/c/{channel}/0/0/0"));
+            std::fs::create_dir_all(chunk.parent().unwrap()).unwrap();
+            std::fs::write(chunk, voxels).unwrap();
+        }
+    }
+    let channel = json!({"name": "c", "type": "channel"});
+    let multiscales =
+        json!([{"axes": [channel, axis("z"), axis("y"), axis("x")], "datasets": datasets}]);
+    let group = json!({"zarr_format": 3, "node_type": "group",
+        "attributes": {"ome": {"version": "0.5", "multiscales": multiscales}}});
+    std::fs::write(image.join("zarr.json"), group.to_string()).unwrap();
+    image.to_str().unwrap().to_owned()
+}
+
+#[test]
+fn a_picture_that_is_coarser_because_memory_is_full_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = noise(folder.path());
+    let picture = folder.path().join("picture.png");
+    // Finer than one voxel a pixel: every brick of the finest level is wanted.
+    let with = |gpu: &str, more: &[&str]| {
+        let fixed = ["--lod-bias", "-2", "--channels", "0", "--gpu-memory", gpu];
+        told(&image, &picture, &[&fixed[..], more].concat())
+    };
+    let Some((plenty, fine)) = with("64", &[]) else {
+        return;
+    };
+    assert_eq!(plenty.trim(), "complete, level 0");
+    let (full, coarse) = with("4", &[]).unwrap();
+    let parts = [
+        "complete, level 1, coarser by ",
+        " levels: GPU memory is full",
+        "--gpu-memory",
+    ];
+    for part in parts {
+        assert!(full.contains(part), "{part:?} is not in: {full}");
+    }
+    assert!(
+        largest_difference(&fine, &coarse) > 10,
+        "the comparison sees no difference"
+    );
+    // Main memory does not make pictures coarser: chunks that it does not keep are read again.
+    let (little, same) = with("64", &["--host-memory", "16"]).unwrap();
+    assert_eq!(little.trim(), "complete, level 0");
+    assert!(largest_difference(&fine, &same) <= ROUNDING);
+
+    let none = ["render", &image, "-o", "never.png", "--gpu-memory", "1"];
+    let output = run(none);
+    assert_eq!(output.status.code(), Some(1));
+    let said = stderr(&output);
+    for part in ["1 MiB of GPU memory are too few", "--gpu-memory "] {
+        assert!(said.contains(part), "{part:?} is not in: {said}");
+    }
+}
+
+#[test]
+fn each_channel_has_its_own_colours_and_surface() {
+    let folder = tempfile::tempdir().unwrap();
+    let image = noise(folder.path());
+    let picture = folder.path().join("picture.png");
+    let transfer = |colour: &str| {
+        format!(
+            r#"{{"polarity": "bright", "color_map": "{colour}", "window": [0.1, 0.8], "opacity_length_nm": 9,
+                "opacity": [{{"value": 0.3, "opacity": 0}}, {{"value": 0.7, "opacity": 0.9}}]}}"#
+        )
+    };
+    let (red, blue) = (transfer("#ff0000"), transfer("#0000ff"));
+    let file = folder.path().join("blue.json");
+    std::fs::write(&file, &blue).unwrap();
+    let sums = |more: &[&str]| {
+        let fixed = ["--mode", "maximum", "--detail", "2"];
+        let (_, picture) = told(&image, &picture, &[&fixed[..], more].concat())?;
+        let mut sums = [0_u32; 3];
+        for pixel in picture.pixels() {
+            for (sum, value) in sums.iter_mut().zip(pixel.0) {
+                *sum += u32::from(value);
+            }
+        }
+        Some(sums)
+    };
+    // The first that is seen, as ever.
+    let Some([r, g, b]) = sums(&["--channels", "1", "--transfer", &red]) else {
+        return;
+    };
+    assert!(r > 100_000 && g == 0 && b == 0, "{r} {g} {b}");
+    let second = format!("1:{}", file.to_str().unwrap());
+    let first = format!("0:{red}");
+    let [r, g, b] = sums(&["--transfer", &second, "--transfer", &first]).unwrap();
+    assert!(r > 100_000 && g == 0 && b > 100_000, "{r} {g} {b}");
+    let alone = [
+        "--transfer",
+        &second,
+        "--transfer",
+        &first,
+        "--channels",
+        "1",
+    ];
+    let [r, g, b] = sums(&alone).unwrap();
+    assert!(r == 0 && g == 0 && b > 100_000, "{r} {g} {b}");
+    let [r, g, b] = sums(&[
+        "--transfer",
+        &second,
+        "--transfer",
+        "1:auto",
+        "--channels",
+        "1",
+    ])
+    .unwrap();
+    assert!(
+        r > 100_000 && g == 0 && b > 100_000,
+        "magenta, as by itself: {r} {g} {b}"
+    );
+
+    // Values go to 220 of 255: above that there is no surface.
+    let surface = |isos: &str| {
+        let of = [
+            "--transfer",
+            &first,
+            "--transfer",
+            &second,
+            "--detail",
+            "2",
+            "--mode",
+            "surface",
+        ];
+        let (_, picture) = told(&image, &picture, &[&of[..], &["--iso", isos]].concat()).unwrap();
+        let lit = |c: usize| picture.pixels().any(|pixel| pixel.0[c] > 40);
+        [lit(0), lit(2)]
+    };
+    assert_eq!(surface("0.95"), [false, false]);
+    assert_eq!(surface("0.4"), [true, true]);
+    assert_eq!(surface("0:0.4,1:0.95"), [true, false]);
+    assert_eq!(surface("0.95,1:0.4"), [false, true]);
+}
+
+/// What is not there yet has a colour of its own, and what is there has not.
+#[test]
+fn false_colours_show_what_is_missing() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let picture = folder.path().join("picture.png");
+    let of = |more: &[&str]| told(&archive, &picture, more).map(|(_, picture)| picture);
+    let Some(complete) = of(&["--false-colors", "none"]) else {
+        return;
+    };
+    let same = of(&["--false-colors", "residency"]).unwrap();
+    assert!(largest_difference(&complete, &same) <= ROUNDING);
+    let early = ["--timeout", "0", "--partial", "--false-colors"];
+    let plain = of(&[&early[..], &["none"]].concat()).unwrap();
+    let tinted = of(&[&early[..], &["residency"]].concat()).unwrap();
+    assert!(largest_difference(&plain, &tinted) > 40);
 }
 
 #[test]
