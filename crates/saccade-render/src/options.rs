@@ -16,9 +16,12 @@ pub enum Traversal {
 /// What a renderer may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RendererOptions {
-    /// Ceiling for bricks, tables and readbacks together \[bytes\]. Small volumes use less. The
-    /// picture and some kilobytes of constants come on top; the host keeps a copy of the tables.
+    /// Ceiling for bricks, tables, readbacks and the picture together \[bytes\]. Small volumes use less.
+    /// Some kilobytes of constants come on top; the host keeps a copy of the tables.
     pub memory_bytes: u64,
+    /// Of that, what is kept for the picture \[bytes\], see [`Renderer::picture_bytes`](crate::Renderer::picture_bytes).
+    /// One that takes more is drawn as well, and [`MemoryUse::total`](crate::MemoryUse::total) says so.
+    pub picture_bytes: u64,
     /// How page tables are cut; `None` chooses by the volume's size.
     pub page_table_shape: Option<PageTableShape>,
     /// How rays find their way.
@@ -38,6 +41,7 @@ impl Default for RendererOptions {
     fn default() -> Self {
         Self {
             memory_bytes: 512 << 20,
+            picture_bytes: 0,
             page_table_shape: None,
             traversal: Traversal::default(),
             octree_cell: None,

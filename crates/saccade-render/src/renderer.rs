@@ -31,6 +31,8 @@ use crate::view::{Mode, View};
 
 /// Storage buffers the ray-caster binds.
 const STORAGE_BUFFERS: u64 = 6;
+/// Bytes of a pixel of the picture.
+const PIXEL_BYTES: u32 = 4;
 /// Page table blocks made for one report; the others come with the next.
 const TABLES_PER_FRAME: u32 = 64;
 
@@ -113,52 +115,13 @@ impl Renderer {
         volume: Arc<Volume>,
         options: RendererOptions,
     ) -> Result<Self, RendererError> {
+        let Planned {
+            tables,
+            octree,
+            octree_slots,
+            plan,
+        } = planned(gpu, &volume, &options)?;
         let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
-        let octree_slots = channels.min(u32::try_from(MOST_CHANNELS).expect("a few"));
-        let shape = options.page_table_shape;
-        let shape = shape.unwrap_or_else(|| PageTableShape::for_volume(&volume.levels, channels));
-        if !(shape.block_edge.is_power_of_two() && (2..=3).contains(&shape.depth)) {
-            return Err(RendererError::PageTableShape { shape });
-        }
-        let tables = PageTables::new(&volume.levels, channels, shape)?;
-        let limits = gpu.device().limits();
-        let buffers = u64::from(limits.max_storage_buffers_per_shader_stage);
-        if buffers < STORAGE_BUFFERS {
-            let what = "storage buffers a shader";
-            return Err(RendererError::Limit {
-                what,
-                offered: buffers,
-                needed: STORAGE_BUFFERS,
-            });
-        }
-        let device = DeviceLimits {
-            texture_edge: limits.max_texture_dimension_3d,
-            rows: limits.max_texture_dimension_2d,
-            buffer: limits
-                .max_buffer_size
-                .min(limits.max_storage_buffer_binding_size),
-        };
-        let ceiling = options.memory_bytes;
-        let octree = (options.traversal == Traversal::ResidencyOctree).then(|| {
-            let cell = options.octree_cell;
-            Geometry::new(&volume, cell.unwrap_or_else(|| default_cell(&volume)))
-        });
-        let octree_size = OctreeSize {
-            blocks: octree.as_ref().map_or(0, Geometry::all_blocks),
-            slots: octree_slots,
-        };
-        let needs = Needs {
-            octree: octree_size,
-            voxel_bytes: u32::try_from(volume.dtype.bytes()).expect("a few bytes"),
-        };
-        let plan = Plan::new(&tables, needs, ceiling, device).map_err(|misfit| match misfit {
-            Misfit::Ceiling(needed) => RendererError::Ceiling { ceiling, needed },
-            Misfit::Buffer(needed) => RendererError::Limit {
-                what: "bytes in a storage buffer",
-                offered: device.buffer,
-                needed,
-            },
-        })?;
         let bands = options.bands.max(1);
         let format = BrickFormat::new(volume.dtype, gpu.device().features(), options.split_16_bit);
         // Between two objects' numbers lies no third object's.
@@ -299,6 +262,37 @@ impl Renderer {
         self.resources.write_colors(&self.gpu, &tables);
     }
 
+    /// What the picture of a view of this size takes \[bytes\].
+    pub fn picture_bytes(&self, size: UVec2) -> u64 {
+        let UVec2 { x, y } = self.drawn_size(size);
+        u64::from(x) * u64::from(y) * u64::from(PIXEL_BYTES)
+    }
+
+    /// A view's size, at least a pixel and at most what the device can draw.
+    fn drawn_size(&self, size: UVec2) -> UVec2 {
+        let most = self.gpu.device().limits().max_texture_dimension_2d;
+        size.clamp(UVec2::ONE, UVec2::splat(most))
+    }
+
+    /// Keeps so much of the ceiling for the picture from now on \[bytes\]. Caches are made anew, of another size, and are
+    /// empty; no channel is seen until [`Self::set_channels`], and frames count from 1.
+    ///
+    /// # Errors
+    ///
+    /// [`RendererError::Ceiling`] when the rest would be too little; nothing changes then.
+    pub fn keep_for_picture(&mut self, picture_bytes: u64) -> Result<(), RendererError> {
+        let options = RendererOptions {
+            picture_bytes,
+            ..self.options
+        };
+        planned(&self.gpu, &self.volume, &options)?;
+        // Before others take their place: both together are above the ceiling.
+        self.resources.destroy();
+        self.picture.texture.destroy();
+        *self = Self::new(&self.gpu, Arc::clone(&self.volume), options)?;
+        Ok(())
+    }
+
     /// Records and submits one frame; never waits. Returns its number.
     ///
     /// Sizes beyond what the device can draw are cut.
@@ -307,8 +301,7 @@ impl Renderer {
             self.pressure.view_changed();
             self.view = Some(*view);
         }
-        let most = self.gpu.device().limits().max_texture_dimension_2d;
-        let size = view.size.clamp(UVec2::ONE, UVec2::splat(most));
+        let size = self.drawn_size(view.size);
         let view = View { size, ..*view };
         if size != self.size() {
             self.picture = self.resources.picture(&self.gpu, size);
@@ -435,13 +428,12 @@ impl Renderer {
     pub fn memory(&self) -> MemoryUse {
         let (bricks_resident, brick_slots) = self.memory.bricks();
         let (tables_resident, table_slots) = self.memory.blocks();
-        let UVec2 { x, y } = self.size();
         MemoryUse {
             bricks: self.plan.brick_bytes(),
             tables: self.plan.table_bytes(),
             octree: self.plan.octree_bytes(),
             readback: self.plan.readback_bytes(),
-            image: u64::from(x) * u64::from(y) * 4,
+            image: self.picture_bytes(self.size()),
             ceiling: self.options.memory_bytes,
             brick_slots,
             bricks_resident,
@@ -496,4 +488,76 @@ impl Renderer {
             memory,
         }
     }
+}
+
+/// How a volume fits a device.
+struct Planned {
+    tables: PageTables,
+    octree: Option<Geometry>,
+    octree_slots: u32,
+    plan: Plan,
+}
+
+fn planned(
+    gpu: &Gpu,
+    volume: &Volume,
+    options: &RendererOptions,
+) -> Result<Planned, RendererError> {
+    let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
+    let octree_slots = channels.min(u32::try_from(MOST_CHANNELS).expect("a few"));
+    let shape = options.page_table_shape;
+    let shape = shape.unwrap_or_else(|| PageTableShape::for_volume(&volume.levels, channels));
+    if !(shape.block_edge.is_power_of_two() && (2..=3).contains(&shape.depth)) {
+        return Err(RendererError::PageTableShape { shape });
+    }
+    let tables = PageTables::new(&volume.levels, channels, shape)?;
+    let limits = gpu.device().limits();
+    let buffers = u64::from(limits.max_storage_buffers_per_shader_stage);
+    if buffers < STORAGE_BUFFERS {
+        let what = "storage buffers a shader";
+        return Err(RendererError::Limit {
+            what,
+            offered: buffers,
+            needed: STORAGE_BUFFERS,
+        });
+    }
+    let device = DeviceLimits {
+        texture_edge: limits.max_texture_dimension_3d,
+        rows: limits.max_texture_dimension_2d,
+        buffer: limits
+            .max_buffer_size
+            .min(limits.max_storage_buffer_binding_size),
+    };
+    let ceiling = options.memory_bytes;
+    let picture = options.picture_bytes;
+    let caches = ceiling.saturating_sub(picture);
+    let octree = (options.traversal == Traversal::ResidencyOctree).then(|| {
+        let cell = options.octree_cell;
+        Geometry::new(volume, cell.unwrap_or_else(|| default_cell(volume)))
+    });
+    let octree_size = OctreeSize {
+        blocks: octree.as_ref().map_or(0, Geometry::all_blocks),
+        slots: octree_slots,
+    };
+    let needs = Needs {
+        octree: octree_size,
+        voxel_bytes: u32::try_from(volume.dtype.bytes()).expect("a few bytes"),
+    };
+    let plan = Plan::new(&tables, needs, caches, device).map_err(|misfit| match misfit {
+        Misfit::Ceiling(needed) => RendererError::Ceiling {
+            ceiling,
+            needed: needed.saturating_add(picture),
+        },
+        Misfit::Buffer(needed) => RendererError::Limit {
+            what: "bytes in a storage buffer",
+            offered: device.buffer,
+            needed,
+        },
+    })?;
+    Ok(Planned {
+        tables,
+        octree,
+        octree_slots,
+        plan,
+    })
 }

@@ -73,7 +73,8 @@ pub struct Statistics {
     pub blocks_used: u32,
 }
 
-/// Memory on the device \[bytes\]: [`Self::total`] stays below the ceiling.
+/// Memory on the device \[bytes\]: [`Self::total`] stays below the ceiling, as long as the picture takes no more than
+/// is kept for it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MemoryUse {
     /// The brick cache.
@@ -105,7 +106,7 @@ pub struct MemoryUse {
 impl MemoryUse {
     /// What counts against the ceiling.
     pub fn total(&self) -> u64 {
-        self.bricks + self.tables + self.octree + self.readback
+        self.bricks + self.tables + self.octree + self.readback + self.image
     }
 }
 

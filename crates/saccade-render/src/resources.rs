@@ -105,6 +105,23 @@ impl Resources {
         }
     }
 
+    /// Gives up what takes memory, as soon as no frame that was submitted needs it.
+    pub(crate) fn destroy(&self) {
+        let buffers = [
+            &self.directory,
+            &self.tables,
+            &self.residents,
+            &self.slot_ranges,
+            &self.missed,
+            &self.report,
+        ];
+        for buffer in buffers {
+            buffer.destroy();
+        }
+        self.nodes.destroy();
+        self.bricks.destroy();
+    }
+
     /// A picture of `size` pixels.
     pub(crate) fn picture(&self, gpu: &Gpu, size: UVec2) -> Picture {
         let texture = image_texture(gpu.device(), size);

@@ -1,5 +1,7 @@
 //! A source, a renderer and the pull between them.
 
+mod memory;
+
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::fmt;
 use std::sync::Arc;
@@ -10,10 +12,9 @@ use saccade_core::brick::BrickId;
 use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
-use saccade_render::wgpu::DeviceType;
 use saccade_render::{
     BrickVoxels, ChannelError, ChannelView, Delivery, Fidelity, FrameReport, Gpu, MemoryUse,
-    Renderer, RendererError, RendererOptions, Statistics, View,
+    Renderer, RendererError, Statistics, View,
 };
 use saccade_source::{ChunkId, ValueRange, VolumeSource};
 
@@ -26,6 +27,7 @@ use crate::host_cache::is_touched;
 use crate::policy::{Limits, Pace, Refresh, Retry};
 use crate::pull::{Freshness, Progress, Pull};
 use crate::requests::{Event, Requests};
+pub use memory::TooLarge;
 
 /// Bricks whose bounds were told, kept in mind; beyond, all are forgotten and told again.
 const MOST_TOLD: usize = 1 << 16;
@@ -39,7 +41,8 @@ pub type Wake = Arc<dyn Fn() + Send + Sync>;
 /// What a session may use.
 #[derive(Clone)]
 pub struct SessionOptions {
-    /// Ceiling for GPU memory \[bytes\]. An eighth of it is kept for the picture and for bricks on their way.
+    /// Ceiling for GPU memory \[bytes\]. An eighth of it is kept for the picture and for bricks on their way, or more
+    /// where the picture takes more. One that leaves too little for bricks is not drawn.
     pub gpu_bytes: u64,
     /// What the pull may take; [`Limits::host_bytes`] is the ceiling for main memory.
     pub limits: Limits,
@@ -163,6 +166,10 @@ pub struct Session {
     frames_in_flight: usize,
     /// Ceiling for GPU memory, as the user set it \[bytes\].
     gpu_bytes: u64,
+    /// Of that, what is kept for the picture \[bytes\].
+    kept_bytes: u64,
+    /// Why nothing is drawn, if that is why.
+    too_large: Option<TooLarge>,
     retry: Retry,
     /// Bricks whose bounds the renderer was told since they last changed.
     told: HashSet<BrickId>,
@@ -200,31 +207,6 @@ fn poll_after(frame_time: Option<Duration>) -> Duration {
     quarter.clamp(Duration::from_millis(4), Duration::from_millis(50))
 }
 
-/// Share of the GPU's ceiling that is kept for the picture and for bricks on their way to it.
-const KEPT_SHARE: u64 = 8;
-
-fn renderer(gpu: &Gpu, volume: &Arc<Volume>, bytes: u64) -> Result<Renderer, SessionError> {
-    // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn.
-    let software = gpu.adapter().device_type == DeviceType::Cpu;
-    let kept = bytes / KEPT_SHARE;
-    let options = RendererOptions {
-        memory_bytes: bytes - kept,
-        bands: if software { 4 } else { 1 },
-        ..RendererOptions::default()
-    };
-    Renderer::new(gpu, volume.clone(), options).map_err(|source| SessionError::Renderer {
-        source: match source {
-            // Of the whole ceiling.
-            RendererError::Ceiling { needed, .. } => RendererError::Ceiling {
-                ceiling: bytes,
-                needed: needed + needed / (KEPT_SHARE - 1) + 1,
-            },
-            other => other,
-        },
-        name: volume.name.clone(),
-    })
-}
-
 impl Session {
     /// Starts listening to the source; nothing is drawn yet.
     ///
@@ -237,7 +219,8 @@ impl Session {
         options: SessionOptions,
     ) -> Result<Self, SessionError> {
         let volume = source.volume().clone();
-        let renderer = renderer(gpu, &volume, options.gpu_bytes)?;
+        let kept_bytes = memory::kept_at_first(options.gpu_bytes);
+        let renderer = memory::renderer(gpu, &volume, options.gpu_bytes, kept_bytes)?;
         let requests = Requests::new(source.clone(), options.wake);
         // Asked after listening began: no change is lost between the two.
         let revision = source.revision();
@@ -254,6 +237,8 @@ impl Session {
             views: Vec::new(),
             frames_in_flight: options.frames_in_flight.max(1),
             gpu_bytes: options.gpu_bytes,
+            kept_bytes,
+            too_large: None,
             told: HashSet::new(),
             ranges: HashMap::new(),
             searched: (HashSet::new(), Vec::new()),
@@ -283,7 +268,14 @@ impl Session {
     ///
     /// [`SessionError`] when the volume does not suit this device; the session stays as it was.
     pub fn set_gpu(&mut self, gpu: &Gpu) -> Result<(), SessionError> {
-        self.renderer = renderer(gpu, self.renderer.volume(), self.gpu_bytes)?;
+        let volume = self.renderer.volume();
+        self.renderer = memory::renderer(gpu, volume, self.gpu_bytes, self.kept_bytes)?;
+        self.begin_again()?;
+        Ok(())
+    }
+
+    /// Nothing is on the device.
+    fn begin_again(&mut self) -> Result<(), ChannelError> {
         self.pull.restart();
         self.told.clear();
         self.pending.clear();
@@ -293,8 +285,7 @@ impl Session {
         self.report = None;
         self.known_at = None;
         self.views.clear();
-        self.put_channels()?;
-        Ok(())
+        self.put_channels()
     }
 
     /// The volume shown.
@@ -431,6 +422,7 @@ impl Session {
         unwatched: bool,
     ) -> Status {
         let now = self.clock.now();
+        self.make_room(view.size);
         self.take_events(now);
         for report in reports {
             self.take_report(report, now);
@@ -455,7 +447,7 @@ impl Session {
     }
 
     fn pace(&self, view: &View, unwatched: bool) -> Pace {
-        let visible = view.size.min_element() > 0;
+        let visible = view.size.min_element() > 0 && self.too_large.is_none();
         Pace {
             view_changed: visible && self.drawn_view != Some(*view),
             data_changed: visible && self.dirty,
@@ -656,7 +648,10 @@ impl Session {
     }
 
     fn status(&self, now: Duration, drew: bool, cut: bool, draws_at: Option<Duration>) -> Status {
-        let progress = self.pull.progress();
+        let mut progress = self.pull.progress();
+        if let Some(too_large) = self.too_large {
+            progress.failure = Some(too_large.to_string());
+        }
         let report = self.report.as_ref();
         let known = self.pending.is_empty() && !self.dirty;
         let searching = self.requests.is_sampling() || self.requests.is_finding();
@@ -681,7 +676,7 @@ impl Session {
             frame: self.drawn,
             drew,
             complete: known && report.is_some_and(FrameReport::is_complete),
-            settled: known && idle && self.refresh.due().is_none(),
+            settled: (known && idle && self.refresh.due().is_none()) || self.too_large.is_some(),
             fidelity: report.map(|r| r.fidelity).unwrap_or_default(),
             lod_bias: report.map_or(0.0, |r| r.lod_bias),
             memory_bias: report.map_or(0.0, |r| r.memory_bias),

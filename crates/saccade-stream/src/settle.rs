@@ -5,7 +5,7 @@ use std::time::Duration;
 use saccade_render::View;
 use tokio::time::{Instant, timeout_at};
 
-use crate::session::{Again, Session, Status};
+use crate::session::{Again, Session, Status, TooLarge};
 
 /// The picture is not what it should be.
 #[derive(Clone, Debug, thiserror::Error)]
@@ -24,6 +24,13 @@ pub enum SettleError {
     Failed {
         /// As far as it came.
         status: Box<Status>,
+    },
+    /// The picture takes too much memory. None was drawn.
+    #[error("nothing was drawn")]
+    TooLarge {
+        /// How much it takes.
+        #[from]
+        source: TooLarge,
     },
     /// The device is gone.
     #[error("the GPU was lost while drawing")]
@@ -62,6 +69,9 @@ impl Session {
             let status = self.advance(view, std::mem::take(&mut reports), true);
             if status.lost {
                 return Err(SettleError::Lost);
+            }
+            if let Some(source) = self.too_large() {
+                return Err(SettleError::TooLarge { source });
             }
             if status.settled {
                 if status.complete {

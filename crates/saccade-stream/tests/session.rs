@@ -592,6 +592,72 @@ async fn a_channel_is_drawn_as_finely_as_its_values_need() {
     }
 }
 
+/// The picture counts: where it takes more than an eighth of the memory, bricks have less, and where it leaves them too
+/// little it is refused.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_large_picture_fits_the_ceiling_or_is_refused() {
+    let Some(gpu) = test_gpu().await else { return };
+    let extent = UVec3::new(330, 290, 150);
+    let volume = Volume::new("blobs", extent, DVec3::new(4.0, 4.0, 8.0)).unwrap();
+    let voxels = VoxelBox::of_size(extent).iter().map(value).collect();
+    let source = Arc::new(ArraySource::new(volume, voxels).unwrap());
+    let ceiling = 5 << 20;
+    let of_bytes = |gpu_bytes| SessionOptions {
+        gpu_bytes,
+        ..options()
+    };
+    let mut session = Session::new(&gpu, source.clone(), of_bytes(ceiling)).unwrap();
+    // Few bricks: this is about the picture.
+    let small = View {
+        lod_bias: 2.0,
+        ..view(source.as_ref())
+    };
+    let lit = |image: &Image| image.rgba.chunks(4).filter(|p| p[0] > 30).count();
+    let first = lit(&picture(&mut session, &small).await);
+    assert!(first > 200, "{first} pixels show blobs");
+    let before = session.renderer().memory();
+    let large = View {
+        size: UVec2::new(640, 480),
+        ..small
+    };
+    session.settle(&large, PATIENCE).await.unwrap();
+    let memory = session.renderer().memory();
+    assert_eq!((before.ceiling, memory.ceiling), (ceiling, ceiling));
+    assert_eq!(memory.image, 640 * 480 * 4);
+    assert!(
+        memory.image > ceiling / 8,
+        "an eighth would have been enough"
+    );
+    assert!(memory.total() <= ceiling, "{memory:?}");
+    assert!(memory.total() > memory.image + memory.bricks);
+    assert!(memory.brick_slots < before.brick_slots, "{memory:?}");
+
+    let too_large = View {
+        size: UVec2::new(1600, 1000),
+        ..small
+    };
+    let refused = session.settle(&too_large, PATIENCE).await.unwrap_err();
+    let SettleError::TooLarge { source: why } = &refused else {
+        panic!("{refused:?}");
+    };
+    assert_eq!((why.size, why.ceiling), (too_large.size, ceiling));
+    assert!(why.needed > ceiling && why.needed < 3 * ceiling, "{why}");
+    let status = session.frame(&too_large);
+    assert!(!status.drew && !status.complete && status.settled);
+    assert_eq!(status.again, Again::WhenWoken);
+    assert_eq!(status.progress.failure, Some(why.to_string()));
+    assert_eq!(session.renderer().size(), large.size, "nothing was drawn");
+    // With as much as was named it is drawn; and smaller ones are in any case.
+    let mut allowed = Session::new(&gpu, source.clone(), of_bytes(why.needed)).unwrap();
+    assert!(allowed.frame(&too_large).drew);
+    let memory = allowed.renderer().memory();
+    assert_eq!(memory.image, 1600 * 1000 * 4);
+    assert!(memory.total() <= why.needed, "{memory:?}");
+    let again = lit(&picture(&mut session, &small).await);
+    assert!(again.abs_diff(first) < first / 20, "{again} and {first}");
+    assert_eq!(session.frame(&small).progress.failure, None);
+}
+
 /// Nothing arrives any more when somebody chooses: what has arrived tells.
 #[tokio::test(flavor = "multi_thread")]
 async fn detail_by_content_may_be_chosen_when_all_is_there() {

@@ -96,10 +96,6 @@ impl Plan {
             return Err(Misfit::Buffer(u64::from(directory) * 4));
         }
         let most_blocks = blocks_of(tables).min(limits.buffer / block_bytes);
-        let blocks = (ceiling / TABLE_SHARE / block_bytes)
-            .max(LEAST_BLOCKS)
-            .min(most_blocks)
-            .clamp(1, 1 << 16);
         let block_texels = u64::from(octree.slots * SIBLINGS);
         let node_block_bytes = block_texels * (TEXEL_BYTES + RESIDENT_BYTES);
         let most_node_blocks = octree
@@ -107,44 +103,50 @@ impl Plan {
             .min(limits.buffer / (block_texels * RESIDENT_BYTES))
             .min(u64::from(limits.rows) * u64::from(NODE_ROW) / block_texels)
             .max(2);
-        let node_blocks = (ceiling / OCTREE_SHARE / node_block_bytes)
-            .max(LEAST_NODE_BLOCKS)
-            .min(most_node_blocks)
-            .min(1 << 24);
-        let plan = |blocks: u64, node_blocks: u64, brick_grid| Self {
-            blocks: u32::try_from(blocks).expect("at most 2^16"),
-            brick_grid,
-            directory,
-            node_blocks: u32::try_from(node_blocks).expect("at most 2^24"),
-            slots: octree.slots,
-            voxel_bytes,
-            block_entries,
+        // All but bricks.
+        let rest = |ceiling: u64| {
+            let blocks = (ceiling / TABLE_SHARE / block_bytes)
+                .max(LEAST_BLOCKS)
+                .min(most_blocks)
+                .clamp(1, 1 << 16);
+            let node_blocks = (ceiling / OCTREE_SHARE / node_block_bytes)
+                .max(LEAST_NODE_BLOCKS)
+                .min(most_node_blocks)
+                .min(1 << 24);
+            Self {
+                blocks: u32::try_from(blocks).expect("at most 2^16"),
+                brick_grid: UVec3::ZERO,
+                directory,
+                node_blocks: u32::try_from(node_blocks).expect("at most 2^24"),
+                slots: octree.slots,
+                voxel_bytes,
+                block_entries,
+            }
         };
         let most_bricks = bricks_of(tables);
-        let tables_only = plan(blocks, node_blocks, UVec3::ZERO);
+        let least_bricks = LEAST_BRICKS.min(most_bricks);
         let per_brick = BRICK_STORED_VOXELS as u64 * u64::from(voxel_bytes) + 4 + 1;
-        let room = ceiling.saturating_sub(tables_only.total_bytes()) / per_brick;
-        if room < LEAST_BRICKS.min(most_bricks) {
-            let smallest = plan(
-                LEAST_BLOCKS.min(most_blocks).max(1),
-                LEAST_NODE_BLOCKS.min(most_node_blocks),
-                UVec3::ZERO,
-            );
-            let needed = smallest.total_bytes() + LEAST_BRICKS.min(most_bricks) * per_brick;
-            return Err(Misfit::Ceiling(needed.max(ceiling + 1)));
+        let room = |ceiling: u64| ceiling.saturating_sub(rest(ceiling).total_bytes()) / per_brick;
+        if room(ceiling) < least_bricks {
+            let mut needed = (ceiling + 1).max(rest(0).total_bytes() + least_bricks * per_brick);
+            // With the ceiling grows what tables and octree take of it.
+            while room(needed) < least_bricks {
+                needed += needed / 256 + 1;
+            }
+            return Err(Misfit::Ceiling(needed));
         }
+        let room = room(ceiling);
         let edge = limits.texture_edge / BRICK_STORED_EDGE;
         let whole = covering_grid(most_bricks, edge);
         let fits = product(whole) >= most_bricks && product(whole) <= room;
-        Ok(plan(
-            blocks,
-            node_blocks,
-            if fits {
+        Ok(Self {
+            brick_grid: if fits {
                 whole
             } else {
                 largest_grid(room, edge)
             },
-        ))
+            ..rest(ceiling)
+        })
     }
 
     /// Brick slots.
@@ -332,7 +334,9 @@ mod tests {
         let Err(Misfit::Ceiling(needed)) = Plan::new(&tables, NEEDS, 100_000, LIMITS) else {
             panic!("100 kB cannot hold a picture's bricks");
         };
-        assert!(Plan::new(&tables, NEEDS, needed + needed / 8, LIMITS).is_ok());
+        assert!(Plan::new(&tables, NEEDS, needed, LIMITS).is_ok());
+        let less = needed - needed / 64;
+        assert!(Plan::new(&tables, NEEDS, less, LIMITS).is_err());
         let small = DeviceLimits {
             buffer: 1000,
             ..LIMITS
