@@ -29,6 +29,9 @@ pub struct RendererOptions {
     /// Size of the residency octree's smallest boxes \[level-0 voxels\], rounded to powers of
     /// two; `None` chooses by the shape of voxels. At coarser levels boxes are as many voxels *of that level*.
     pub octree_cell: Option<UVec3>,
+    /// Nodes of the residency octree that are visited before a frame, to bring it up to date, give or take a brick's: half a
+    /// microsecond each. What is left waits for the next frame.
+    pub nodes_per_frame: u64,
     /// Keep 16-bit voxels as two 8-bit parts even where the device has a format for them: the same
     /// picture, as devices without one draw it. For comparison.
     pub split_16_bit: bool,
@@ -45,6 +48,7 @@ impl Default for RendererOptions {
             page_table_shape: None,
             traversal: Traversal::default(),
             octree_cell: None,
+            nodes_per_frame: 4_096,
             split_16_bit: false,
             bands: 1,
         }

@@ -36,10 +36,6 @@ const PIXEL_BYTES: u32 = 4;
 /// Page table blocks made for one report; the others come with the next.
 const TABLES_PER_FRAME: u32 = 64;
 
-/// Nodes of the octree visited before a frame, to bring it up to date. What is left waits for the
-/// next frame.
-const NODES_PER_FRAME: u64 = 32_768;
-
 /// Draws one volume. See the crate's documentation for the way of a frame.
 #[derive(Debug)]
 pub struct Renderer {
@@ -101,6 +97,7 @@ struct Readback {
     frame: Frame,
     lod_bias: f32,
     memory_bias: f32,
+    octree_is_current: bool,
 }
 
 impl Renderer {
@@ -135,6 +132,7 @@ impl Renderer {
             frame: 0,
             lod_bias: 0.0,
             memory_bias: 0.0,
+            octree_is_current: false,
         };
         Ok(Self {
             gpu: gpu.clone(),
@@ -315,11 +313,13 @@ impl Renderer {
             resources.write_entries(gpu, array, first, entries);
         });
         if let Some(octree) = &mut self.octree {
-            octree.advance(NODES_PER_FRAME);
+            octree.advance(self.options.nodes_per_frame);
             octree.flush(|first, texels, resident| {
                 resources.write_nodes(gpu, first, texels, resident);
             });
         }
+        let octree = self.octree.as_ref();
+        let octree_is_current = octree.is_none_or(ResidencyOctree::is_current);
         let scene = Scene {
             volume: &self.volume,
             tables: self.memory.tables(),
@@ -349,6 +349,7 @@ impl Renderer {
             readback.frame = frame;
             readback.lod_bias = lod_bias;
             readback.memory_bias = memory_bias;
+            readback.octree_is_current = octree_is_current;
         }
         self.memory.frame_submitted();
         frame
@@ -367,10 +368,12 @@ impl Renderer {
                     frame,
                     lod_bias,
                     memory_bias,
+                    octree_is_current,
                     ..
                 } = *readback;
+                let biases = (lod_bias, memory_bias);
                 match words {
-                    Some(words) => arrived.push((frame, lod_bias, memory_bias, words)),
+                    Some(words) => arrived.push((frame, biases, octree_is_current, words)),
                     None => log::warn!("the report of frame {frame} was lost"),
                 }
             }
@@ -378,9 +381,10 @@ impl Renderer {
         arrived.sort_unstable_by_key(|(frame, ..)| *frame);
         let reports = arrived
             .into_iter()
-            .map(|(frame, lod_bias, memory_bias, words)| {
+            .map(|(frame, biases, octree_is_current, words)| {
                 let mut report = self.read_report(frame, &words);
-                (report.lod_bias, report.memory_bias) = (lod_bias, memory_bias);
+                (report.lod_bias, report.memory_bias) = biases;
+                report.octree_is_current = octree_is_current;
                 report
             });
         reports.collect()
@@ -484,6 +488,7 @@ impl Renderer {
             redraw: bias_moves || tables_made > 0,
             lod_bias: 0.0,
             memory_bias: 0.0,
+            octree_is_current: false,
             statistics: report.statistics(bricks_used, blocks_used),
             memory,
         }

@@ -26,6 +26,9 @@ pub struct FrameReport {
     pub lod_bias: f32,
     /// Part of `lod_bias` that was added because the bricks of the view do not fit the memory.
     pub memory_bias: f32,
+    /// Whether the octree knew all that was delivered and noted before the frame. Where it did not, the picture is the
+    /// same; it took longer, and bricks may be missed that were noted to be hidden.
+    pub octree_is_current: bool,
     /// What the rays did.
     pub statistics: Statistics,
     /// Memory in use.

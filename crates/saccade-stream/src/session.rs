@@ -171,8 +171,9 @@ pub struct Session {
     /// Why nothing is drawn, if that is why.
     too_large: Option<TooLarge>,
     retry: Retry,
-    /// Bricks whose bounds the renderer was told since they last changed.
-    told: HashSet<BrickId>,
+    /// Bricks whose bounds the renderer was told since they last changed; for those that are hidden, the first frame
+    /// that may know.
+    told: HashMap<BrickId, Option<u64>>,
     /// Bounds of chunks that were looked up since they last changed.
     ranges: HashMap<ChunkId, Option<ValueRange>>,
     /// Bricks, and their chunks, whose bounds are being looked up.
@@ -239,7 +240,7 @@ impl Session {
             gpu_bytes: options.gpu_bytes,
             kept_bytes,
             too_large: None,
-            told: HashSet::new(),
+            told: HashMap::new(),
             ranges: HashMap::new(),
             searched: (HashSet::new(), Vec::new()),
             lost: HashSet::new(),
@@ -555,7 +556,9 @@ impl Session {
             return;
         };
         let (frame, misses) = (report.frame, report.misses.clone());
-        let (hidden, unknown) = self.hidden(&misses);
+        // What a frame does not know yet it misses.
+        let knows = report.octree_is_current.then_some(frame);
+        let (hidden, unknown) = self.hidden(&misses, knows);
         let seen = misses.into_iter();
         let seen = seen.filter(|id| !hidden.contains(id) && !unknown.contains(id));
         self.pull.want(frame, &seen.collect::<Vec<_>>());
@@ -565,8 +568,12 @@ impl Session {
 
     /// Of the bricks missed, those that the source knows to hold nothing that can be seen, and those of
     /// which that is being looked up. The renderer is told of the former, once: a brick that is missed
-    /// again is needed.
-    fn hidden(&mut self, misses: &[BrickId]) -> (HashSet<BrickId>, HashSet<BrickId>) {
+    /// again, by a frame that knows, is needed.
+    fn hidden(
+        &mut self,
+        misses: &[BrickId],
+        knows: Option<u64>,
+    ) -> (HashSet<BrickId>, HashSet<BrickId>) {
         if self.told.len() > MOST_TOLD {
             self.told.clear();
         }
@@ -575,7 +582,10 @@ impl Session {
         let (mut bricks, mut chunks) = (HashSet::new(), Vec::new());
         let mut seen = HashSet::new();
         for &id in misses {
-            if self.told.contains(&id) {
+            if let Some(told) = self.told.get(&id) {
+                if told.is_some_and(|first| knows.is_none_or(|frame| frame < first)) {
+                    hidden.insert(id);
+                }
                 continue;
             }
             let (ranges, requests) = (&self.ranges, &self.requests);
@@ -594,12 +604,13 @@ impl Session {
                 unknown.insert(id);
                 continue;
             }
-            self.told.insert(id);
-            if let Some(range) = range.flatten()
-                && self.renderer.note_range(id, [range.min, range.max])
-            {
+            let hides = range
+                .flatten()
+                .is_some_and(|range| self.renderer.note_range(id, [range.min, range.max]));
+            if hides {
                 hidden.insert(id);
             }
+            self.told.insert(id, hides.then_some(self.drawn + 1));
         }
         if !chunks.is_empty() && !self.requests.is_finding() {
             self.requests.find_ranges(chunks.clone());

@@ -330,7 +330,6 @@ impl ResidencyOctree {
     }
 
     /// Whether all events are applied.
-    #[cfg(test)]
     pub(crate) fn is_current(&self) -> bool {
         self.events.is_empty()
     }

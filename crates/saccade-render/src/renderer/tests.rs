@@ -101,3 +101,52 @@ fn evictions_before_a_change_of_polarity_are_noted() {
     let noted = octree.noted();
     assert_eq!(noted, resident(&renderer), "the octree knows of others");
 }
+
+/// Many bricks at once are worked into the octree a few at a time, and all of them in the end.
+#[test]
+fn a_burst_of_bricks_is_spread_over_frames() {
+    let Some(gpu) = test_gpu() else { return };
+    let extent = UVec3::new(330, 290, 150);
+    let volume = Volume::new("v", extent, DVec3::splat(4.0)).unwrap();
+    let volume = Arc::new(volume);
+    let options = RendererOptions {
+        memory_bytes: 64 << 20,
+        ..RendererOptions::default()
+    };
+    let mut renderer = Renderer::new(&gpu, Arc::clone(&volume), options).unwrap();
+    renderer
+        .set_channels(&views(0..1, Polarity::Bright))
+        .unwrap();
+    let view = View::new(Camera::around(&volume), UVec2::new(8, 8));
+    assert!(frame(&mut renderer, &view).octree_is_current, "of nothing");
+    // Values that no two regions have in common.
+    let noise: Vec<u8> = (0..BRICK_STORED_VOXELS)
+        .map(|i| u8::try_from(i * 7919 / 13 % 251).unwrap())
+        .collect();
+    let bricks = saccade_core::brick::bricks_of(extent);
+    for brick in saccade_core::voxel_box::VoxelBox::of_size(bricks).iter() {
+        let id = BrickId::new(0, 0, brick).unwrap();
+        renderer.deliver(id, BrickVoxels::Voxels(&noise)).unwrap();
+    }
+    // What one brick takes, or one step of a change.
+    let brick = 1024;
+    let mut frames = 0;
+    loop {
+        let visited = |renderer: &Renderer| renderer.octree.as_ref().unwrap().visited();
+        let before = visited(&renderer);
+        let report = frame(&mut renderer, &view);
+        frames += 1;
+        let visits = visited(&renderer) - before;
+        let most = RendererOptions::default().nodes_per_frame + brick;
+        assert!(visits <= most, "{visits} visits before frame {frames}");
+        if report.octree_is_current {
+            break;
+        }
+        assert!(frames < 200, "it never ends");
+    }
+    assert!(frames > 5, "{frames} frames are not many");
+    let octree = renderer.octree.as_ref().unwrap();
+    let resident: Vec<_> = renderer.memory.resident(0).collect();
+    assert_eq!(octree.noted().len(), resident.len());
+    assert!(octree.residency_is_complete());
+}

@@ -11,7 +11,7 @@ use saccade_render::{
     ChannelError, ChannelView, Fidelity, Gpu, Image, Renderer, RendererOptions, Traversal, View,
 };
 
-use crate::harness::{frame, gpu, keep, psnr, read, settle};
+use crate::harness::{caught_up, frame, gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
 use crate::scene::{Scene, ramp, specks, stained, tissue, waves};
 
@@ -242,18 +242,9 @@ fn the_octree_makes_room_for_other_channels() {
     assert_eq!(exchanged.channels().len(), 9, "refused sets change nothing");
 }
 
-/// Frames of one view until the octree is as it stays: the samples of the last.
+/// Samples of a frame whose octree knows all that it will.
 fn samples(renderer: &mut Renderer, view: &View) -> u64 {
-    let mut before = u64::MAX;
-    for _ in 0..40 {
-        let report = frame(renderer, view);
-        let samples = report.statistics.samples;
-        if samples == before {
-            return samples;
-        }
-        before = samples;
-    }
-    panic!("there is no end to it");
+    caught_up(renderer, view).statistics.samples
 }
 
 /// What was known of resident bricks is known again when their channel is seen again, or has the bins it had.

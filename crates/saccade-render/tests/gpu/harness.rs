@@ -39,6 +39,17 @@ pub(crate) fn frame(renderer: &mut Renderer, view: &View) -> FrameReport {
     report
 }
 
+/// The same, until the octree knows all that was delivered.
+pub(crate) fn caught_up(renderer: &mut Renderer, view: &View) -> FrameReport {
+    for _ in 0..200 {
+        let report = frame(renderer, view);
+        if report.octree_is_current {
+            return report;
+        }
+    }
+    panic!("the octree is behind after 200 frames");
+}
+
 /// Delivers one brick of the scene.
 pub(crate) fn deliver(renderer: &mut Renderer, scene: &Scene, id: BrickId) -> Delivery {
     let delivered = match scene.brick(id) {

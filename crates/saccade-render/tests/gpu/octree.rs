@@ -11,7 +11,7 @@ use saccade_render::{
     BrickVoxels, FrameReport, Gpu, Image, Renderer, RendererOptions, Traversal, View,
 };
 
-use crate::harness::{deliver, frame, gpu, keep, psnr, read, settle};
+use crate::harness::{caught_up, deliver, frame, gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
 use crate::scene::{Scene, specks, tissue, waves};
 
@@ -35,7 +35,7 @@ fn renderer(gpu: &Gpu, scene: &Scene, traversal: Traversal, cell: Option<[u32; 3
 /// The picture with everything resident, and what a frame took that began with all that known.
 fn picture(renderer: &mut Renderer, view: &View, scene: &Scene) -> (Image, FrameReport) {
     settle(renderer, view, scene);
-    let report = frame(renderer, view);
+    let report = caught_up(renderer, view);
     assert!(report.is_complete());
     (read(renderer), report)
 }
@@ -175,7 +175,7 @@ fn what_is_known_to_be_hidden_is_not_asked_for_again() {
             lod_bias: -2.0,
             ..View::new(Camera::around(&scene.volume), SIZE)
         };
-        let report = frame(&mut renderer, &view);
+        let report = caught_up(&mut renderer, &view);
         let (resident, slots) = (report.memory.bricks_resident, report.memory.brick_slots);
         let bricks = renderer
             .volume()

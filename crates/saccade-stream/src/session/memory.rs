@@ -44,12 +44,14 @@ pub(super) fn renderer(
     bytes: u64,
     kept_bytes: u64,
 ) -> Result<Renderer, SessionError> {
-    // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn.
+    // Drivers that draw on the CPU take seconds for a frame; in parts, others get a turn. Work before it does not count
+    // there, and other drivers have drawn the frame by then.
     let software = gpu.adapter().device_type == DeviceType::Cpu;
     let options = RendererOptions {
         memory_bytes: bytes,
         picture_bytes: kept_bytes,
         bands: if software { 4 } else { 1 },
+        nodes_per_frame: if software { 32_768 } else { 4_096 },
         ..RendererOptions::default()
     };
     Renderer::new(gpu, volume.clone(), options).map_err(|source| SessionError::Renderer {
