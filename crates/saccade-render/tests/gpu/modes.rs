@@ -7,15 +7,15 @@ use glam::{DVec3, UVec2, UVec3};
 use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
 use saccade_core::camera::Camera;
 use saccade_core::space::Point;
-use saccade_core::transfer::ColorMap;
+use saccade_core::transfer::{ColorMap, linear_from_srgb};
 use saccade_core::volume::{Polarity, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
     BrickVoxels, Clip, Gpu, HalfSpace, Heat, Image, Mode, Renderer, RendererOptions, Slab,
-    Traversal, View, Work,
+    Statistics, Traversal, View, Work,
 };
 
-use crate::harness::{frame, gpu, keep, psnr, read, settle};
+use crate::harness::{caught_up, frame, gpu, keep, psnr, read, settle};
 use crate::oracle::{self, Cut};
 use crate::scene::{Scene, ramp, specks, stained, tissue, waves};
 
@@ -473,5 +473,59 @@ fn heat_shows_the_work_of_rays() {
             light.push(picture.rgba.iter().map(|&v| u64::from(v)).sum::<u64>());
         }
         assert!(light[0] > light[1], "{of:?}: {light:?}");
+    }
+}
+
+/// All the heat of a picture together is what the frame counted of that kind of work, and of no other.
+#[test]
+fn heat_is_of_the_work_it_says() {
+    let Some(gpu) = gpu() else { return };
+    let scene = specks();
+    let [_, view] = views(&scene);
+    let mut renderer = Renderer::new(&gpu, scene.volume.clone(), Default::default()).unwrap();
+    renderer.set_channels(&scene.views()).unwrap();
+    settle(&mut renderer, &view, &scene);
+    let counts = |statistics: Statistics| {
+        [
+            f64::from(statistics.lookups),
+            f64::from(statistics.nodes),
+            statistics.samples as f64,
+        ]
+    };
+    let plain = caught_up(&mut renderer, &view).statistics;
+    for (index, of) in [Work::Lookups, Work::Nodes, Work::Samples]
+        .into_iter()
+        .enumerate()
+    {
+        let mut full = counts(plain)[index] / f64::from(plain.rays);
+        // Up to a third of the scale heat is red alone, and rises with the count.
+        let (seen, counted) = loop {
+            full *= 1.5;
+            let heat = Heat {
+                of,
+                full: full as f32,
+            };
+            let view = View {
+                heat: Some(heat),
+                ..view
+            };
+            let statistics = frame(&mut renderer, &view).statistics;
+            let pixels = read(&renderer).rgba;
+            if pixels.chunks_exact(4).all(|p| p[1] == 0) {
+                let red = pixels
+                    .chunks_exact(4)
+                    .map(|p| linear_from_srgb(f32::from(p[0]) / 255.0));
+                let sum: f64 = red.map(f64::from).sum();
+                break (sum / 3.0 * full, counts(statistics));
+            }
+        };
+        for (other, &count) in counted.iter().enumerate() {
+            let same = (seen / count - 1.0).abs() < 0.03;
+            assert_eq!(
+                same,
+                other == index,
+                "{of:?}: {seen:.0} seen, counted were {counted:?}"
+            );
+        }
     }
 }
