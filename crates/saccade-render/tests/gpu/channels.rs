@@ -120,6 +120,41 @@ fn sixteen_bit_looks_as_eight_bit_does() {
     }
 }
 
+/// Contrast is a matter of the colour table alone.
+#[test]
+fn another_contrast_asks_for_nothing() {
+    let Some(gpu) = gpu() else { return };
+    let scene = waves().deep(16);
+    let view = view(Camera::around(&scene.volume).zoomed(1.5));
+    let mut renderer = renderer(&gpu, &scene, RendererOptions::default());
+    let reports = settle(&mut renderer, &view, &scene);
+    let asked = reports.iter().map(|report| report.misses.len());
+    assert!(asked.sum::<usize>() > 0, "bricks were never asked for");
+    let [own] = scene.views().try_into().unwrap();
+    let resident = renderer.memory().bricks_resident;
+    let mut pictures = vec![read(&renderer)];
+    for step in 1..=5_u8 {
+        let mut other = ChannelView::clone(&own);
+        let share = f32::from(step) * 0.08;
+        other.transfer.window = [
+            own.transfer.window[0] + share * own.transfer.window[1],
+            own.transfer.window[1] * (1.0 - share),
+        ];
+        renderer.set_channels(&[other]).unwrap();
+        let report = frame(&mut renderer, &view);
+        assert!(report.is_complete() && !report.redraw, "window {step}");
+        assert_eq!(report.misses, [], "window {step}");
+        assert_eq!(report.fidelity.missing, 0, "window {step}");
+        assert_eq!(renderer.memory().bricks_resident, resident);
+        let picture = read(&renderer);
+        assert!(!pictures.contains(&picture), "window {step} looks the same");
+        pictures.push(picture);
+    }
+    renderer.set_channels(&[own]).unwrap();
+    assert!(frame(&mut renderer, &view).misses.is_empty());
+    assert!(read(&renderer) == pictures[0], "there and back");
+}
+
 /// Values of the waves as they are, in 16 bit: 0.4 % of all that there are.
 fn waves_of_few_values() -> Scene {
     waves().deep(2)
