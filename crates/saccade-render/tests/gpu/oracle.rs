@@ -254,17 +254,19 @@ fn color(scene: &Scene, stored: f64) -> [f64; 4] {
 mod tests {
     use super::*;
     use crate::scene::ramp;
+    use glam::{DVec2, UVec3};
     use saccade_core::camera::Camera;
     use saccade_core::space::Point;
-    use saccade_core::transfer::ColorMap;
+    use saccade_core::transfer::{ColorMap, TransferFunction};
     use saccade_core::volume::Polarity;
+    use saccade_render::{Clip, Slab};
 
     /// A slab of extinction s and thickness d transmits exp(-s d).
     #[test]
     fn oracle_agrees_with_the_closed_form() {
         let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 0.2)], 50.0);
         // So many voxels that the soft edges of the slab matter little.
-        let scene = Scene::new(glam::UVec3::splat(64), DVec3::splat(4.0), transfer, |_| 0.0);
+        let scene = Scene::new(UVec3::splat(64), DVec3::splat(4.0), transfer, |_| 0.0);
         let scene = Scene {
             levels: scene.levels.iter().map(|l| vec![1; l.len()]).collect(),
             ..scene
@@ -289,5 +291,147 @@ mod tests {
             (light - transmitted).abs() < 1e-3,
             "{light} instead of {transmitted}"
         );
+    }
+
+    /// A cube of 64 voxels of 4 nm, of which each has the value of its place \[voxels\].
+    fn cube(transfer: TransferFunction, value: impl Fn(DVec3) -> f64) -> Scene {
+        Scene::new(UVec3::splat(64), DVec3::splat(4.0), transfer, |nm| {
+            value(nm / 4.0)
+        })
+    }
+
+    /// The light of one ray along z through a place \[nm\], all but parallel to its neighbours, in front of blue.
+    fn light_at(scene: &Scene, at: DVec2, mode: Mode, clip: Clip) -> [f64; 3] {
+        let camera = Camera {
+            target: Point::new(at.extend(128.0)),
+            distance_nm: 1e6,
+            yaw: 0.0,
+            pitch: 0.0,
+            fov: 0.01,
+        };
+        let view = View {
+            background: [0.0, 0.0, 1.0],
+            lod_bias: -20.0,
+            mode,
+            clip,
+            ..View::new(camera, UVec2::ONE)
+        };
+        trace(scene, &view, UVec2::ZERO, Cut::Fine)
+    }
+
+    fn slab_at(z: f64, thickness_nm: f64) -> Clip {
+        Clip {
+            slab: Some(Slab {
+                point: Point::new(DVec3::new(0.0, 0.0, z)),
+                normal: DVec3::Z,
+                thickness_nm,
+            }),
+            ..Clip::default()
+        }
+    }
+
+    /// The surface of a sphere lies where its radius says, and is as bright as it faces the eye.
+    #[test]
+    fn a_sphere_has_its_surface_where_it_should() {
+        let radius = 80.0;
+        let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 1.0)], 100.0);
+        // 128 at the radius, and 8 more for each voxel inwards.
+        let mut scene = cube(transfer, |at| {
+            128.0 + 8.0 * (radius / 4.0 - (at - 32.0).length())
+        });
+        scene.iso = 128.0;
+        let [own, ..] = color(&scene, 128.0);
+        for off in [0.0, 30.0, 55.0, 70.0] {
+            let at = DVec2::new(128.0 + off * 0.6, 128.0 - off * 0.8);
+            let deep = f64::sqrt(radius * radius - off * off);
+            let [light, _, blue] = light_at(&scene, at, Mode::IsoSurface, Clip::default());
+            let want = own * (0.15 + 0.85 * deep / radius);
+            assert!(
+                (light - want).abs() < 0.02 * own,
+                "{off} nm off: {light}, not {want}"
+            );
+            assert_eq!(light, blue, "the background is hidden");
+            // Only what ends behind the surface shows it: it is met there, to half a voxel.
+            let front = 128.0 - deep;
+            for (end, met) in [(front - 2.0, false), (front + 2.0, true)] {
+                let clip = slab_at(end / 2.0, end);
+                let seen = light_at(&scene, at, Mode::IsoSurface, clip);
+                assert_eq!(seen[2] < 0.9, met, "{off} nm off, up to {end} nm: {seen:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_maximum_of_a_ramp_is_at_its_end() {
+        let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 0.0)], 100.0);
+        let scene = cube(transfer.clone(), |at| 10.0 + 3.0 * (at.z - 0.5));
+        let middle = DVec2::splat(128.0);
+        let shown = |value: f64| f64::from(transfer.color_at((value / 255.0) as f32)[0]);
+        for (clip, value) in [
+            (Clip::default(), 199.0),
+            // Up to the middle of the fifth voxel, and between two others.
+            (slab_at(9.0, 18.0), 22.0),
+            (slab_at(150.0, 20.0), 10.0 + 3.0 * 39.5),
+        ] {
+            let [light, ..] = light_at(&scene, middle, Mode::Maximum, clip);
+            let want = shown(value);
+            assert!(
+                (light - want).abs() < 0.01 * want,
+                "{clip:?}: {light}, not {want}"
+            );
+        }
+    }
+
+    /// Extinctions add up; light is shared by them.
+    #[test]
+    fn two_constant_channels_mix_by_extinction() {
+        // Colours that do not depend on the value, as that fades towards the faces.
+        let transfer = |map, opacity| TransferFunction {
+            window: [-1.0, 0.0],
+            ..ramp(Polarity::Bright, map, &[(0.0, opacity)], 50.0)
+        };
+        let of = |map, opacity| {
+            let scene = cube(transfer(map, opacity), |_| 0.0);
+            Scene {
+                levels: scene.levels.iter().map(|l| vec![1; l.len()]).collect(),
+                ..scene
+            }
+        };
+        let (green, magenta) = (of(ColorMap::Green, 0.3), of(ColorMap::Magenta, 0.1));
+        let extinctions = [0.3_f64, 0.1].map(|opacity| -(1.0 - opacity).ln() / 50.0);
+        let colors = [&green, &magenta].map(|scene| color(scene, 1.0));
+        let scene = Scene::of_channels(vec![green, magenta]);
+        let thickness = 100.0;
+        let clip = slab_at(128.0, thickness);
+        let light = light_at(&scene, DVec2::splat(128.0), Mode::EmissionAbsorption, clip);
+        let sum: f64 = extinctions.iter().sum();
+        let transmitted = (-sum * thickness).exp();
+        for c in 0..3 {
+            let emitted = (extinctions[0] * colors[0][c] + extinctions[1] * colors[1][c]) / sum;
+            let behind = if c == 2 { transmitted } else { 0.0 };
+            let want = (1.0 - transmitted) * emitted + behind;
+            assert!((light[c] - want).abs() < 1e-3, "{light:?} has not {want}");
+        }
+        assert!(light[0] > 0.05 && light[1] > 0.3, "{light:?}");
+    }
+
+    #[test]
+    fn a_slab_lets_through_what_its_thickness_says() {
+        let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 0.2)], 50.0);
+        let scene = cube(transfer, |_| 0.0);
+        let scene = Scene {
+            levels: scene.levels.iter().map(|l| vec![1; l.len()]).collect(),
+            ..scene
+        };
+        for thickness in [1.0, 20.0, 77.0, 200.0] {
+            let clip = slab_at(128.0, thickness);
+            let at = DVec2::splat(128.0);
+            let [.., blue] = light_at(&scene, at, Mode::EmissionAbsorption, clip);
+            let want = 0.8_f64.powf(thickness / 50.0);
+            assert!(
+                (blue - want).abs() < 1e-3,
+                "{thickness} nm: {blue} not {want}"
+            );
+        }
     }
 }
