@@ -79,9 +79,8 @@
 //!
 //! # What it does not do
 //!
-//! It fetches nothing, opens no window, starts no thread and reads no clock. Labels are not drawn as such yet: they
-//! are taken for shades, and where two objects meet samples lie between their numbers;
-//! transfer functions have one dimension.
+//! It fetches nothing, opens no window, starts no thread and reads no clock. Labels have no colours of their own yet: their
+//! numbers are taken for shades. Transfer functions have one dimension.
 
 mod channel;
 mod delivery;
