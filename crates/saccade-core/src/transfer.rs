@@ -64,7 +64,9 @@ impl TransferFunction {
         } else {
             (value - low) / span
         };
-        self.color_map.linear_rgb(t.clamp(0.0, 1.0))
+        // Of a window that is no number, too.
+        let t = if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) };
+        self.color_map.linear_rgb(t)
     }
 
     /// Colour and opacity for each value *as bricks store it* ([`Polarity::stored`]): linear RGB,
@@ -122,6 +124,20 @@ mod tests {
         for (value, want) in [(0.0, 0.8), (0.25, 0.8), (0.5, 0.4), (0.75, 0.0), (1.0, 0.0)] {
             assert!((tf.opacity_at(value) - want).abs() < 1e-6, "at {value}");
         }
+    }
+
+    #[test]
+    fn windows_that_are_no_numbers_have_colours_that_are() {
+        let numbers = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 0.0, 0.5, -1e30];
+        for window in numbers.into_iter().flat_map(|a| numbers.map(|b| [a, b])) {
+            let transfer = TransferFunction { window, ..ramp() };
+            for value in [0.0, 0.3, 1.0] {
+                let color = transfer.color_at(value);
+                let holds = color.iter().all(|c| (0.0..=1.0).contains(c));
+                assert!(holds, "{window:?} at {value}: {color:?}");
+            }
+        }
+        assert!(ramp().color_at(0.9) > ramp().color_at(0.1));
     }
 
     #[test]
