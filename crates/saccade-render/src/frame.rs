@@ -9,15 +9,15 @@ use saccade_core::volume::Volume;
 
 use crate::channel::ChannelView;
 use crate::layout::{
-    CHANNEL_RESIDENCY, CHANNEL_VALUES, ChannelUniform, DepthUniform, FLAG_JITTER, FLAG_NEAREST,
-    FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform, HEAT_LOOKUPS, HEAT_NODES, HEAT_NONE, HEAT_SAMPLES,
-    LevelUniform, MODE_EMISSION_ABSORPTION, MODE_ISO_SURFACE, MODE_MAXIMUM, MOST_CHANNELS,
-    MOST_DEPTHS, MOST_PLANES, OctreeUniform,
+    CHANNEL_RESIDENCY, CHANNEL_VALUES, ChannelUniform, DepthUniform, FALSE_LEVEL, FALSE_NONE,
+    FALSE_RESIDENCY, FLAG_JITTER, FLAG_NEAREST, FLAG_OCTREE, FLAG_SUBSTITUTE, FrameUniform,
+    HEAT_LOOKUPS, HEAT_NODES, HEAT_NONE, HEAT_SAMPLES, LevelUniform, MODE_EMISSION_ABSORPTION,
+    MODE_ISO_SURFACE, MODE_MAXIMUM, MOST_CHANNELS, MOST_DEPTHS, MOST_PLANES, OctreeUniform,
 };
 use crate::memory::plan::Plan;
 use crate::octree::ResidencyOctree;
 use crate::transfer_table::TransferTable;
-use crate::view::{Clip, HalfSpace, Mode, Slab, View, Work};
+use crate::view::{Clip, FalseColors, HalfSpace, Mode, Slab, View, Work};
 
 /// Anchors stay this near to the volume \[bricks, cells\]; beyond, positions need no precision.
 const ANCHOR_REACH: f64 = 1e6;
@@ -246,6 +246,15 @@ pub(crate) fn mode_of(mode: Mode) -> u32 {
         Mode::EmissionAbsorption => MODE_EMISSION_ABSORPTION,
         Mode::Maximum => MODE_MAXIMUM,
         Mode::IsoSurface => MODE_ISO_SURFACE,
+    }
+}
+
+/// The shader's name of what colours tell.
+pub(crate) fn false_colors_of(false_colors: FalseColors) -> u32 {
+    match false_colors {
+        FalseColors::None => FALSE_NONE,
+        FalseColors::Residency => FALSE_RESIDENCY,
+        FalseColors::Level => FALSE_LEVEL,
     }
 }
 

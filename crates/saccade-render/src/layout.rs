@@ -33,6 +33,13 @@ pub(crate) const MODE_MAXIMUM: u32 = 1;
 /// The first surface.
 pub(crate) const MODE_ISO_SURFACE: u32 = 2;
 
+/// Colours are those of values.
+pub(crate) const FALSE_NONE: u32 = 0;
+/// What is drawn from another level than wanted is tinted, and what is missing lies in fog.
+pub(crate) const FALSE_RESIDENCY: u32 = 1;
+/// All is tinted by the level it is drawn from.
+pub(crate) const FALSE_LEVEL: u32 = 2;
+
 /// The volume is drawn.
 pub(crate) const HEAT_NONE: u32 = 0;
 /// Page table walks are drawn.
@@ -195,21 +202,27 @@ pub(crate) struct Variant {
     pub(crate) mode: u32,
     /// Whether voxels are two parts that are joined before they are interpolated.
     pub(crate) joined: bool,
-    /// Whether substitutes are tinted, and what is missing lies in fog.
-    pub(crate) tinted: bool,
+    /// One of `FALSE_`.
+    pub(crate) false_colors: u32,
     /// Whether samples are kept within their bricks: numbers alone do not where voxels are too far away for f32.
     pub(crate) bounded: bool,
 }
 
 impl Variant {
     /// For so many channels: variants are few, so that showing one channel more rarely compiles.
-    pub(crate) fn new(channels: usize, mode: u32, joined: bool, tinted: bool, far: bool) -> Self {
+    pub(crate) fn new(
+        channels: usize,
+        mode: u32,
+        joined: bool,
+        false_colors: u32,
+        far: bool,
+    ) -> Self {
         let channels = u32::try_from(channels).expect("a few channels");
         Self {
             slots: channels.max(1).next_power_of_two(),
             mode,
             joined,
-            tinted,
+            false_colors,
             // What lies around a surface is sampled as well, up to a voxel further.
             bounded: far || mode == MODE_ISO_SURFACE,
         }
@@ -222,7 +235,7 @@ pub(crate) fn ray_cast(variant: Variant) -> String {
         slots,
         mode,
         joined,
-        tinted,
+        false_colors,
         bounded,
     } = variant;
     // With one channel there is nothing to count.
@@ -232,7 +245,7 @@ pub(crate) fn ray_cast(variant: Variant) -> String {
         "frame.channel_count | nothing"
     };
     format!(
-        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\nconst TINTED = {tinted};\nconst BOUNDED = {bounded};\n\
+        "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\nconst FALSE_COLORS = {false_colors}u;\nconst BOUNDED = {bounded};\n\
          fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}"
     )
 }
@@ -257,13 +270,14 @@ mod tests {
     use saccade_core::transfer::TABLE_LEN;
     use std::mem::{offset_of, size_of};
 
-    const VARIANTS: [(usize, u32, bool, bool, bool); 6] = [
-        (1, MODE_EMISSION_ABSORPTION, false, false, false),
-        (1, MODE_EMISSION_ABSORPTION, false, false, true),
-        (1, MODE_MAXIMUM, true, true, false),
-        (1, MODE_ISO_SURFACE, false, false, false),
-        (2, MODE_EMISSION_ABSORPTION, true, true, true),
-        (16, MODE_ISO_SURFACE, false, true, false),
+    const VARIANTS: [(usize, u32, bool, u32, bool); 7] = [
+        (1, MODE_EMISSION_ABSORPTION, false, FALSE_NONE, false),
+        (1, MODE_EMISSION_ABSORPTION, false, FALSE_NONE, true),
+        (1, MODE_MAXIMUM, true, FALSE_RESIDENCY, false),
+        (1, MODE_ISO_SURFACE, false, FALSE_NONE, false),
+        (2, MODE_EMISSION_ABSORPTION, true, FALSE_RESIDENCY, true),
+        (4, MODE_EMISSION_ABSORPTION, false, FALSE_LEVEL, false),
+        (16, MODE_ISO_SURFACE, false, FALSE_LEVEL, false),
     ];
 
     fn parsed(source: &str) -> naga::Module {
@@ -272,19 +286,19 @@ mod tests {
     }
 
     fn module() -> naga::Module {
-        let [joined, tinted, far] = [false; 3];
-        let variant = Variant::new(1, MODE_EMISSION_ABSORPTION, joined, tinted, far);
+        let [joined, far] = [false; 2];
+        let variant = Variant::new(1, MODE_EMISSION_ABSORPTION, joined, FALSE_NONE, far);
         parsed(&ray_cast(variant))
     }
 
     #[test]
     fn every_shader_is_valid_without_any_optional_feature() {
-        for (channels, mode, joined, tinted, far) in VARIANTS {
+        for (channels, mode, joined, false_colors, far) in VARIANTS {
             let mut validator = naga::valid::Validator::new(
                 naga::valid::ValidationFlags::all(),
                 naga::valid::Capabilities::empty(),
             );
-            let source = ray_cast(Variant::new(channels, mode, joined, tinted, far));
+            let source = ray_cast(Variant::new(channels, mode, joined, false_colors, far));
             let module = parsed(&source);
             validator
                 .validate(&module)
@@ -357,6 +371,9 @@ mod tests {
             ("MODE_EMISSION_ABSORPTION", MODE_EMISSION_ABSORPTION),
             ("MODE_MAXIMUM", MODE_MAXIMUM),
             ("MODE_ISO_SURFACE", MODE_ISO_SURFACE),
+            ("FALSE_NONE", FALSE_NONE),
+            ("FALSE_RESIDENCY", FALSE_RESIDENCY),
+            ("FALSE_LEVEL", FALSE_LEVEL),
             ("HEAT_NONE", HEAT_NONE),
             ("HEAT_LOOKUPS", HEAT_LOOKUPS),
             ("HEAT_NODES", HEAT_NODES),

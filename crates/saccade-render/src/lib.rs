@@ -107,6 +107,6 @@ pub use image::{Image, ReadError};
 pub use options::{RendererError, RendererOptions, Traversal};
 pub use renderer::Renderer;
 pub use report::{Fidelity, FrameReport, MemoryUse, Statistics};
-pub use view::{Clip, HalfSpace, Heat, Mode, Slab, View, Work};
+pub use view::{Clip, FalseColors, HalfSpace, Heat, Mode, Slab, View, Work};
 /// The GPU interface, so that all rooms use one version.
 pub use wgpu;

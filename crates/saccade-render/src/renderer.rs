@@ -14,7 +14,7 @@ use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Polarity, Volume, VoxelKind};
 
 use crate::channel::{self, ChannelError, ChannelView};
-use crate::frame::{Scene, Seen, frame_uniform, is_far, mode_of};
+use crate::frame::{Scene, Seen, false_colors_of, frame_uniform, is_far, mode_of};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
 use crate::layout::{MOST_CHANNELS, Variant};
@@ -337,7 +337,7 @@ impl Renderer {
             self.channels.len(),
             mode_of(self.mode),
             self.format.is_joined(),
-            view.false_colors,
+            false_colors_of(view.false_colors),
             is_far(&uniform),
         );
         let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());

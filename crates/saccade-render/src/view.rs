@@ -17,6 +17,47 @@ pub enum Mode {
     IsoSurface,
 }
 
+/// What colours tell besides values.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum FalseColors {
+    /// Nothing: they are those of the transfer function.
+    #[default]
+    None,
+    /// What is drawn from another level than wanted is tinted, from green, one level coarser, to red, and blue where it is
+    /// finer; what is missing lies in a magenta fog.
+    Residency,
+    /// Everything is tinted by the level that it is drawn from, as [`Self::of_level`] says.
+    Level,
+}
+
+impl From<bool> for FalseColors {
+    /// Nothing, or residency.
+    fn from(residency: bool) -> Self {
+        if residency {
+            Self::Residency
+        } else {
+            Self::None
+        }
+    }
+}
+
+/// Tints of levels, from the finest on and then again. Mirrors `color.wgsl`; a test compares the two.
+const LEVEL_TINTS: [[f32; 3]; 6] = [
+    [0.9, 0.1, 0.1],
+    [0.9, 0.7, 0.05],
+    [0.15, 0.7, 0.1],
+    [0.05, 0.7, 0.8],
+    [0.1, 0.2, 1.0],
+    [0.8, 0.15, 0.8],
+];
+
+impl FalseColors {
+    /// What [`Self::Level`] tints a level with, linear RGB, for a legend.
+    pub fn of_level(level: u32) -> [f32; 3] {
+        LEVEL_TINTS[level as usize % LEVEL_TINTS.len()]
+    }
+}
+
 /// What is drawn instead of the volume: how much work each ray was, from black through red and yellow to white.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Heat {
@@ -97,8 +138,8 @@ pub struct View {
     pub lod_bias: f32,
     /// Draw missing bricks from other levels where those are resident.
     pub substitute: bool,
-    /// Tint what is drawn from other levels, and show what is missing.
-    pub false_colors: bool,
+    /// What colours tell besides values.
+    pub false_colors: FalseColors,
     /// Draw the work of rays instead.
     pub heat: Option<Heat>,
     /// Behind everything, linear RGB in `[0, 1]`.
@@ -117,7 +158,7 @@ impl View {
             clip: Clip::default(),
             lod_bias: 0.0,
             substitute: true,
-            false_colors: false,
+            false_colors: FalseColors::None,
             heat: None,
             background: [0.0; 3],
             jitter: false,

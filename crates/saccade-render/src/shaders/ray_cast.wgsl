@@ -95,11 +95,17 @@ fn color_of(channel: u32, stored: f32) -> vec4f {
     return select(vec4f(0.0), color, stored > 0.0);
 }
 
-// In false colours, how far the level that is drawn lies from the one that is wanted.
-fn tinted(channel: u32, color: vec4f) -> vec4f {
-    let distance = i32(drawn[channel].level) - i32(drawn_for[channel]);
-    let tint = mix(color.rgb, substitution_tint(distance), 0.5);
-    return vec4f(select(tint, color.rgb, distance == 0), color.a);
+// In false colours, how far the level that is drawn lies from the one that is wanted, or which it is.
+fn false_color(color: vec3f, level: u32, wanted: u32) -> vec3f {
+    if FALSE_COLORS == FALSE_LEVEL {
+        return mix(color, level_tint(level), 0.5);
+    }
+    if FALSE_COLORS == FALSE_RESIDENCY {
+        let distance = i32(level) - i32(wanted);
+        let tint = mix(color, substitution_tint(distance), 0.5);
+        return select(tint, color, distance == 0);
+    }
+    return color;
 }
 
 // What is drawn for a stretch of the ray.
@@ -158,10 +164,13 @@ var<private> next_low: array<vec3f, 2>;
 var<private> turns: vec2f;
 // The sample before, of surfaces [0, 1].
 var<private> sample_before: array<f32, SLOTS>;
+// The levels that the largest values were drawn from and wanted at, in false colours.
+var<private> largest_from: array<vec2u, SLOTS>;
 
-// The surface that ends a ray: its channel, its level and where it is.
+// The surface that ends a ray: its channel, its level and the one wanted, and where it is.
 var<private> surface: u32;
 var<private> surface_level: u32;
+var<private> surface_wanted: u32;
 var<private> surface_at: vec3f;
 // How far ahead of the first sample it is; nothing there is farther.
 var<private> hit_at: f32;
@@ -341,12 +350,12 @@ fn sampled_at(channel: u32, ahead: f32, step: f32) -> vec4f {
     let stored = stored_at(in_brick(channel, ahead));
     if MODE == MODE_EMISSION_ABSORPTION {
         let color = color_of(channel, stored);
-        if TINTED {
-            return tinted(channel, color);
-        }
-        return color;
+        return vec4f(false_color(color.rgb, drawn[channel].level, drawn_for[channel]), color.a);
     }
     if MODE == MODE_MAXIMUM {
+        if FALSE_COLORS != FALSE_NONE && stored > largest_seen[channel] {
+            largest_from[channel] = vec2u(drawn[channel].level, drawn_for[channel]);
+        }
         largest_seen[channel] = max(largest_seen[channel], stored);
     } else {
         let iso = frame.channels[channel].iso;
@@ -360,6 +369,7 @@ fn sampled_at(channel: u32, ahead: f32, step: f32) -> vec4f {
                 hit_at = at;
                 surface = channel;
                 surface_level = drawn[channel].level;
+                surface_wanted = drawn_for[channel];
                 surface_at = in_brick(channel, at);
             }
         }
@@ -382,7 +392,8 @@ fn lit_surface(ray: vec3f) -> vec3f {
     let facing = abs(dot(gradient, ray)) / max(length(gradient) * length(ray), 1e-30);
     // Where values do not change there is no surface to light: as if it faced the eye.
     let diffuse = select(facing, 1.0, length(gradient) <= 1e-30);
-    return color_of(surface, frame.channels[surface].iso).rgb * (0.15 + 0.85 * diffuse);
+    let color = color_of(surface, frame.channels[surface].iso).rgb;
+    return false_color(color, surface_level, surface_wanted) * (0.15 + 0.85 * diffuse);
 }
 
 // Loops, from the outside: look-ups that find no brick at once; stretches of one level and step; regions with
@@ -494,7 +505,8 @@ fn trace(pixel: vec2u) -> vec3f {
                     for (var c = 0u; c < channel_count(); c += 1u) {
                         if (hidden & (1u << c)) == 0u {
                             let color = color_of(c, uniform_stored[c]);
-                            sum += vec4f(color.a * color.rgb, color.a);
+                            let from_ = channel_level(c, level);
+                            sum += vec4f(color.a * false_color(color.rgb, from_, from_), color.a);
                         }
                     }
                     if sum.a > 0.0 {
@@ -653,7 +665,7 @@ fn trace(pixel: vec2u) -> vec3f {
                         }
                     }
                     samples -= left * countOneBits(sampled);
-                    if TINTED && (missing & ~hidden) != 0u {
+                    if FALSE_COLORS == FALSE_RESIDENCY && (missing & ~hidden) != 0u {
                         // A thin magenta fog: half the light is gone after 64 voxels.
                         let voxels = f32(count) * step * voxels_per_depth;
                         let opacity = 1.0 - exp2(-voxels / 64.0);
@@ -699,7 +711,8 @@ fn trace(pixel: vec2u) -> vec3f {
         var met = false;
         for (var c = 0u; c < channel_count(); c += 1u) {
             if largest_seen[c] > 0.0 {
-                light += transmitted * color_of(c, largest_seen[c]).rgb;
+                let color = color_of(c, largest_seen[c]).rgb;
+                light += transmitted * false_color(color, largest_from[c].x, largest_from[c].y);
                 met = true;
             }
         }

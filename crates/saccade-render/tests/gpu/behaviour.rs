@@ -13,7 +13,7 @@ use saccade_core::transfer::{ColorMap, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
-    BrickVoxels, Delivery, DeliveryError, FrameReport, Gpu, Renderer, RendererError,
+    BrickVoxels, Delivery, DeliveryError, FalseColors, FrameReport, Gpu, Renderer, RendererError,
     RendererOptions, Traversal, View,
 };
 
@@ -203,7 +203,7 @@ fn coarser_bricks_stand_in_and_say_so() {
     frame(
         &mut renderer,
         &View {
-            false_colors: true,
+            false_colors: FalseColors::Residency,
             ..view
         },
     );

@@ -1,6 +1,6 @@
 //! The pure functions of `shaders/lib`, one by one, as properties.
 
-use saccade_render::{Gpu, wgpu};
+use saccade_render::{FalseColors, Gpu, wgpu};
 
 use crate::harness::gpu;
 
@@ -82,6 +82,19 @@ fn opacity_does_not_depend_on_the_step() {
             (got[0] - want).abs() < 1e-5,
             "step {step:?}: {got:?} instead of {want}"
         );
+    }
+}
+
+/// A legend shows what is drawn.
+#[test]
+fn levels_have_the_tints_that_are_told() {
+    let Some(gpu) = gpu() else { return };
+    let levels: Vec<_> = (0..14_u8).map(|n| [f32::from(n), 0.0, 0.0, 0.0]).collect();
+    let tints = eval(&gpu, COLOR, "vec4f(level_tint(u32(x.x)), 1.0)", &levels);
+    for (level, [rgb @ .., _]) in (0..).zip(&tints) {
+        assert_eq!(*rgb, FalseColors::of_level(level), "level {level}");
+        let next = FalseColors::of_level(level + 1);
+        assert!(rgb != &next, "level {level} and the one after it");
     }
 }
 

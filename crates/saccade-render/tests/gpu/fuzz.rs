@@ -10,7 +10,8 @@ use saccade_core::space::Point;
 use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_render::{
-    ChannelView, Clip, HalfSpace, Heat, Mode, Renderer, RendererOptions, Slab, View, Work,
+    ChannelView, Clip, FalseColors, HalfSpace, Heat, Mode, Renderer, RendererOptions, Slab, View,
+    Work,
 };
 
 use crate::harness::{deliver, frame, gpu, read};
@@ -109,7 +110,12 @@ fn view(volume: &Volume) -> impl Strategy<Value = View> + use<> {
     let heat = prop::sample::select(vec![Work::Lookups, Work::Nodes, Work::Samples]);
     let heat = (heat, single()).prop_map(|(of, full)| Heat { of, full });
     let size = (0..24_u32, 0..24_u32).prop_map(|(x, y)| UVec2::new(x, y));
-    let flags = (any::<bool>(), prop::bool::weighted(0.2), any::<bool>());
+    let false_colors = prop_oneof![
+        8 => Just(FalseColors::None),
+        1 => Just(FalseColors::Residency),
+        1 => Just(FalseColors::Level),
+    ];
+    let flags = (any::<bool>(), false_colors, any::<bool>());
     (
         (camera(volume), clip(volume), size, numbers(-3.0..3.0)),
         prop::sample::select(modes),
@@ -157,7 +163,7 @@ fn draw(
     // stored as 0.
     let telling = channel.transfer.color_map == ColorMap::Viridis
         && view.heat.is_none()
-        && !view.false_colors
+        && view.false_colors == FalseColors::None
         // A surface of what no voxel can be has no colour.
         && (view.mode != Mode::IsoSurface || (0.01..=1.0).contains(&channel.iso));
     let view = &View {

@@ -8,6 +8,7 @@
 
 mod behaviour;
 mod channels;
+mod false_colors;
 mod functions;
 mod fuzz;
 mod harness;

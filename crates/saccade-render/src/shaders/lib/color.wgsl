@@ -20,6 +20,30 @@ fn substitution_tint(levels: i32) -> vec3f {
     return vec3f(min(2.0 * t + 0.1, 1.0), min(2.0 - 2.0 * t, 1.0), 0.0);
 }
 
+// What is drawn from a level: red, yellow, green, cyan, blue, magenta in turn, from the finest on.
+fn level_tint(level: u32) -> vec3f {
+    switch level % 6u {
+        case 0u: {
+            return vec3f(0.9, 0.1, 0.1);
+        }
+        case 1u: {
+            return vec3f(0.9, 0.7, 0.05);
+        }
+        case 2u: {
+            return vec3f(0.15, 0.7, 0.1);
+        }
+        case 3u: {
+            return vec3f(0.05, 0.7, 0.8);
+        }
+        case 4u: {
+            return vec3f(0.1, 0.2, 1.0);
+        }
+        default: {
+            return vec3f(0.8, 0.15, 0.8);
+        }
+    }
+}
+
 // From black through red and yellow to white, linear, for a share of 0 to 1.
 fn heat_color(share: f32) -> vec3f {
     return clamp(vec3f(3.0 * share, 3.0 * share - 1.0, 3.0 * share - 2.0), vec3f(0.0), vec3f(1.0));

@@ -25,6 +25,10 @@ const MODE_EMISSION_ABSORPTION = 0u;
 const MODE_MAXIMUM = 1u;
 const MODE_ISO_SURFACE = 2u;
 
+const FALSE_NONE = 0u;
+const FALSE_RESIDENCY = 1u;
+const FALSE_LEVEL = 2u;
+
 const HEAT_NONE = 0u;
 const HEAT_LOOKUPS = 1u;
 const HEAT_NODES = 2u;
