@@ -10,9 +10,11 @@ mod folder;
 mod http;
 mod location;
 mod memory;
+mod refusals;
 mod retry;
 #[cfg(not(target_family = "wasm"))]
 mod s3;
+mod same;
 
 use std::fmt;
 use std::ops::Range;

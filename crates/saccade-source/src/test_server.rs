@@ -11,6 +11,8 @@ use bytes::Bytes;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 
+use crate::objects::{HttpObjects, Objects, Patience, S3Objects};
+
 /// What happens to a request.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Fault {
@@ -106,6 +108,22 @@ impl TestServer {
         let mut objects = Vec::new();
         collect(folder, "", &mut objects);
         Self::start(objects).await
+    }
+
+    /// The same objects by S3's requests, which differ in paths only.
+    pub(crate) fn s3(&self, patience: Patience) -> S3Objects {
+        let endpoint = self.url.trim_end_matches("/sub").to_owned();
+        let settings = [
+            ("AWS_ENDPOINT_URL".to_owned(), endpoint),
+            ("AWS_REGION".to_owned(), "us-east-1".to_owned()),
+        ];
+        S3Objects::with_settings(&"s3://sub".parse().unwrap(), settings, patience).unwrap()
+    }
+
+    /// Both ways to its objects.
+    pub(crate) fn stores(&self, patience: Patience) -> [Arc<dyn Objects>; 2] {
+        let http = HttpObjects::with_patience(&self.url, patience).unwrap();
+        [Arc::new(http), Arc::new(self.s3(patience))]
     }
 
     pub(crate) fn fail_next(&self, faults: impl IntoIterator<Item = Fault>) {

@@ -2,10 +2,12 @@ use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read, Seek, SeekFrom};
 use std::path::{Component, Path, PathBuf};
 use std::sync::{Arc, OnceLock};
+use std::time::SystemTime;
 
 use bytes::Bytes;
 use tokio::sync::Semaphore;
 
+use super::same::Marks;
 use super::{ObjectError, Objects, Part, is_key};
 use crate::maybe_send::BoxFuture;
 
@@ -24,6 +26,8 @@ pub struct FolderObjects {
     folder: PathBuf,
     /// Where that is without links, once it was there.
     real: Arc<OnceLock<PathBuf>>,
+    /// Of files that were read in parts.
+    marks: Arc<Marks<Mark>>,
     reads: Arc<Semaphore>,
 }
 
@@ -33,6 +37,7 @@ impl FolderObjects {
         Self {
             folder: folder.to_owned(),
             real: Arc::default(),
+            marks: Arc::default(),
             reads: Arc::new(Semaphore::new(AT_ONCE)),
         }
     }
@@ -49,6 +54,7 @@ impl FolderObjects {
             self.real.clone(),
             self.folder.join(key),
         );
+        let (marks, name) = (self.marks.clone(), key.to_owned());
         // The semaphore is never closed. A read that nobody waits for any more keeps its place until it ends.
         let place = self.reads.clone().acquire_owned().await.ok();
         let read = tokio::task::spawn_blocking(move || {
@@ -56,7 +62,12 @@ impl FolderObjects {
             let Some(path) = inside(&folder, &real, &path)? else {
                 return Ok(None);
             };
-            read_part(&path, &part)
+            let Some((bytes, mark)) = read_part(&path, &part)? else {
+                return Ok(None);
+            };
+            let location = || path.display().to_string();
+            marks.check(&name, &part, Some(mark), location)?;
+            Ok(Some(bytes))
         });
         match read.await {
             Ok(read) => read,
@@ -125,7 +136,32 @@ fn inside(
     }
 }
 
-fn read_part(path: &Path, part: &Part) -> Result<Option<Bytes>, ObjectError> {
+/// What tells a file from one that took its place, or that was written anew.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Mark {
+    written: Option<SystemTime>,
+    length: u64,
+    /// Device and number.
+    #[cfg(unix)]
+    inode: (u64, u64),
+}
+
+impl Mark {
+    fn of(file: &File) -> io::Result<Self> {
+        let found = file.metadata()?;
+        Ok(Self {
+            written: found.modified().ok(),
+            length: found.len(),
+            #[cfg(unix)]
+            inode: {
+                use std::os::unix::fs::MetadataExt as _;
+                (found.dev(), found.ino())
+            },
+        })
+    }
+}
+
+fn read_part(path: &Path, part: &Part) -> Result<Option<(Bytes, Mark)>, ObjectError> {
     let location = || path.display().to_string();
     let failed = |source: io::Error| failed(source, path);
     let mut file = match File::open(path) {
@@ -133,7 +169,8 @@ fn read_part(path: &Path, part: &Part) -> Result<Option<Bytes>, ObjectError> {
         Err(error) if is_missing(&error) => return Ok(None),
         Err(error) => return Err(failed(error)),
     };
-    let length = file.metadata().map_err(failed)?.len();
+    let mark = Mark::of(&file).map_err(failed)?;
+    let length = mark.length;
     let wanted = match part {
         Part::Whole { most } if length > *most => {
             return Err(ObjectError::TooLong {
@@ -161,11 +198,18 @@ fn read_part(path: &Path, part: &Part) -> Result<Option<Bytes>, ObjectError> {
     if bytes.try_reserve_exact(space).is_err() {
         return Err(failed(ErrorKind::OutOfMemory.into()));
     }
-    file.take(count).read_to_end(&mut bytes).map_err(failed)?;
+    let mut wanted = file.take(count);
+    wanted.read_to_end(&mut bytes).map_err(failed)?;
     if bytes.len() as u64 != count {
         return Err(failed(ErrorKind::UnexpectedEof.into()));
     }
-    Ok(Some(bytes.into()))
+    // One that is written while it is read is neither what it was nor what it will be.
+    if !matches!(part, Part::Whole { .. }) && Mark::of(wanted.get_ref()).map_err(failed)? != mark {
+        return Err(ObjectError::Replaced {
+            location: location(),
+        });
+    }
+    Ok(Some((bytes.into(), mark)))
 }
 
 impl Objects for FolderObjects {

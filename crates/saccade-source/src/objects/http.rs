@@ -13,21 +13,18 @@ mod tests;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytes::Bytes;
-use quick_cache::sync::Cache;
-use reqwest::header::{HeaderMap, HeaderValue};
+use reqwest::header::HeaderMap;
 use reqwest::{Client, StatusCode, Url, header};
-use tokio::sync::{OnceCell, Semaphore};
+use tokio::sync::Semaphore;
 
 use super::error::Failure;
+use super::refusals::{EXPIRED, Found, Refusal, Refusals};
+use super::same::{Marks, strong};
 use super::{LocationError, ObjectError, Objects, Part, Patience, is_key};
 use crate::maybe_send::BoxFuture;
 
 /// Requests under way at once; more wait here, first come, first served.
 const REQUESTS: usize = 24;
-/// Objects read in parts whose tags are remembered.
-const TAGS: usize = 1 << 14;
-/// Names an object that nobody has: see [`HttpObjects`].
-const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
 
 const ADVICE: &str = "the server wants credentials, or does not allow this object to be read";
 
@@ -36,9 +33,10 @@ const ADVICE: &str = "the server wants credentials, or does not allow this objec
 /// # Answers
 ///
 /// 404 and 410 mean that there is no such object. 403 does as well where the store answers so for
-/// whatever it does not have, as S3 does to those who may not list: with the first 403 it is asked for an
-/// object that nobody can have. 429, 5xx, broken connections, cut and stalled answers are asked for
-/// again, see [`Patience`]. A server that ignores ranges is put up with, and told of.
+/// whatever it does not have, as S3 does to those who may not list: with a 403 it is asked for an object that nobody can
+/// have, and for one that was read before, so that a login that ran out is not taken for a hole. 401 is always an error.
+/// 429, 5xx, broken connections, cut and stalled answers are asked for again, see [`Patience`]. A server that ignores
+/// ranges is put up with, and told of.
 ///
 /// Parts of an object belong together: where the server tags what it sends (`ETag`) and a part has another tag than the one before,
 /// the object was replaced in between, which is an error. Browsers show tags only where the server exposes them.
@@ -59,13 +57,10 @@ pub struct HttpObjects {
     suffixes: bool,
     /// Whether any answer could be read so far.
     heard: AtomicBool,
-    /// Tags of objects that were read in parts, by address.
-    tags: Cache<Url, HeaderValue>,
+    /// Tags of objects that were read in parts.
+    tags: Marks<String>,
     requests: Semaphore,
-    /// Whether missing objects are forbidden here, once it was asked.
-    forbids_missing: OnceCell<bool>,
-    /// Whether any answer was other than a refusal.
-    granted: AtomicBool,
+    refusals: Refusals,
 }
 
 impl HttpObjects {
@@ -96,10 +91,9 @@ impl HttpObjects {
             patience,
             suffixes: platform::SUFFIXES,
             heard: AtomicBool::new(false),
-            tags: Cache::new(TAGS),
+            tags: Marks::default(),
             requests: Semaphore::new(REQUESTS),
-            forbids_missing: OnceCell::new(),
-            granted: AtomicBool::new(false),
+            refusals: Refusals::default(),
         })
     }
 
@@ -133,24 +127,26 @@ impl HttpObjects {
             },
             part => part,
         };
-        let asked = self
-            .patience
-            .attempts(self, key, || self.attempt(&url, &part));
-        match asked.await? {
-            Found::Object(bytes) => {
-                self.granted.store(true, Ordering::Relaxed);
-                Ok(Some(bytes))
-            }
-            Found::Nothing => {
-                self.granted.store(true, Ordering::Relaxed);
-                Ok(None)
-            }
-            Found::Forbidden if self.forbids_missing().await? => Ok(None),
-            Found::Forbidden => Err(ObjectError::Denied {
-                advice: ADVICE,
-                location: shown(&url),
-            }),
-        }
+        let found = self.ask(key, &part).await?;
+        let other = |key: String| -> BoxFuture<'_, _> {
+            Box::pin(async move { self.ask(&key, &Part::Range(0..1)).await })
+        };
+        let location = shown(&url);
+        let settled = self.refusals.settle(key, found, &location, other);
+        let advice = match settled.await? {
+            Ok(bytes) => return Ok(Some(bytes)),
+            Err(Refusal::Missing) => return Ok(None),
+            Err(Refusal::Denied) => ADVICE,
+            Err(Refusal::Expired) => EXPIRED,
+        };
+        Err(ObjectError::Denied { advice, location })
+    }
+
+    async fn ask(&self, key: &str, part: &Part) -> Result<Found, ObjectError> {
+        let url = self.url(key);
+        self.patience
+            .attempts(self, key, || self.attempt(key, &url, part))
+            .await
     }
 
     /// The length of an object, if its server tells; `None` if there is no such object.
@@ -174,26 +170,6 @@ impl HttpObjects {
         self.patience.attempts(self, key, ask).await
     }
 
-    /// Asks, once, for an object that there cannot be.
-    async fn forbids_missing(&self) -> Result<bool, ObjectError> {
-        let ask = async || {
-            let url = self.url(NOBODYS);
-            let part = Part::Whole { most: 1 << 20 };
-            let asked = self
-                .patience
-                .attempts(self, NOBODYS, || self.attempt(&url, &part));
-            let forbids = matches!(asked.await?, Found::Forbidden);
-            if forbids {
-                let base = shown(&self.base);
-                log::warn!(
-                    "forbidden objects are taken for missing ones, as all missing ones are forbidden: {base}"
-                );
-            }
-            Ok(forbids)
-        };
-        self.forbids_missing.get_or_try_init(ask).await.copied()
-    }
-
     async fn send(
         &self,
         request: reqwest::RequestBuilder,
@@ -212,26 +188,15 @@ impl HttpObjects {
     }
 
     /// Whether a part is of the same object as the parts before, as far as tags tell.
-    fn is_the_same(&self, url: &Url, part: &Part, of: &HeaderMap) -> Result<(), Failure> {
-        let tag = of.get(header::ETAG);
-        // Weak tags are of what is as good, not of the same bytes.
-        let tag = tag.filter(|tag| !tag.as_bytes().starts_with(b"W/"));
-        let (Some(tag), false) = (tag, matches!(part, Part::Whole { .. })) else {
-            return Ok(());
-        };
-        match self.tags.get(url) {
-            Some(before) if before == tag => Ok(()),
-            Some(_) => Err(Failure::Final(ObjectError::Replaced {
-                location: shown(url),
-            })),
-            None => {
-                self.tags.insert(url.clone(), tag.clone());
-                Ok(())
-            }
-        }
+    fn is_the_same(&self, key: &str, part: &Part, of: &HeaderMap) -> Result<(), Failure> {
+        let tag = of.get(header::ETAG).and_then(|tag| tag.to_str().ok());
+        let checked = self
+            .tags
+            .check(key, part, tag.and_then(strong), || self.location(key));
+        checked.map_err(Failure::Final)
     }
 
-    async fn attempt(&self, url: &Url, part: &Part) -> Result<Found, Failure> {
+    async fn attempt(&self, key: &str, url: &Url, part: &Part) -> Result<Found, Failure> {
         // The semaphore is never closed.
         let _permit = self.requests.acquire().await.ok();
         let mut request = self.client.get(url.clone());
@@ -249,12 +214,13 @@ impl HttpObjects {
         let status = answer.status();
         match status {
             StatusCode::OK | StatusCode::PARTIAL_CONTENT => {
-                self.is_the_same(url, part, answer.headers())?;
+                self.is_the_same(key, part, answer.headers())?;
                 let bytes = answer::read(answer, part, self.patience, &shown(url)).await?;
                 Ok(Found::Object(bytes))
             }
             StatusCode::NOT_FOUND | StatusCode::GONE => Ok(Found::Nothing),
-            StatusCode::FORBIDDEN | StatusCode::UNAUTHORIZED => Ok(Found::Forbidden),
+            StatusCode::FORBIDDEN => Ok(Found::Forbidden),
+            StatusCode::UNAUTHORIZED => Ok(Found::Unknown),
             StatusCode::RANGE_NOT_SATISFIABLE => match part {
                 Part::Range(range) => Err(Failure::Final(ObjectError::TooShort {
                     wanted: range.clone(),
@@ -302,19 +268,12 @@ impl Objects for HttpObjects {
     }
 
     fn denied(&self) -> Option<&'static str> {
-        let forbidden = self.forbids_missing.get() == Some(&true);
-        (forbidden && !self.granted.load(Ordering::Relaxed)).then_some(ADVICE)
+        self.refusals.all_refused().then_some(ADVICE)
     }
 
     fn read_cost(&self) -> u64 {
         256 << 10
     }
-}
-
-enum Found {
-    Object(Bytes),
-    Nothing,
-    Forbidden,
 }
 
 /// Whether the same question may be answered better later.

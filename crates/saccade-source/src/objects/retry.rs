@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use futures::future::{Either, select};
+use web_time::Instant;
 
 use super::error::Failure;
 use super::{ObjectError, Objects};
@@ -79,6 +80,32 @@ impl Patience {
                 let seconds = self.idle.as_secs_f32();
                 Err(Failure::again(format!("nothing came for {seconds} s")))
             }
+        }
+    }
+}
+
+/// Whether an answer that has begun comes fast enough.
+pub(super) struct Pace {
+    patience: Patience,
+    begun: Instant,
+}
+
+impl Pace {
+    pub(super) fn new(patience: Patience) -> Self {
+        #[expect(clippy::disallowed_methods, reason = "web_time's, which browsers have")]
+        let begun = Instant::now();
+        Self { patience, begun }
+    }
+
+    /// Of which so many bytes have come by now.
+    pub(super) fn check(&self, come: u64) -> Result<(), Failure> {
+        let seconds = self.begun.elapsed().saturating_sub(self.patience.idle);
+        let least = seconds.as_secs_f64() * f64::from(self.patience.slowest);
+        match (come as f64) < least {
+            true => Err(Failure::again(format!(
+                "no more than {come} bytes came in time"
+            ))),
+            false => Ok(()),
         }
     }
 }

@@ -1,16 +1,23 @@
+mod told;
+
 use std::env;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bytes::Bytes;
+use futures::StreamExt as _;
 use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey, resolve_bucket_region};
 use object_store::path::Path;
-use object_store::{ClientOptions, Error, GetOptions, GetRange, ObjectStore, RetryConfig};
+use object_store::{
+    ClientOptions, Error, GetOptions, GetRange, GetResult, ObjectStore, RetryConfig,
+};
 use saccade_archive::storage::BucketLocation;
 use tokio::sync::{OnceCell, Semaphore};
 
 use super::error::Failure;
+use super::refusals::{EXPIRED, Found, Refusal, Refusals};
+use super::retry::Pace;
+use super::same::{Marks, strong};
 use super::{LocationError, ObjectError, Objects, Part, Patience, is_key};
 use crate::maybe_send::BoxFuture;
 
@@ -24,7 +31,6 @@ const CREDENTIALS: [&str; 5] = [
     "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
     "AWS_CONTAINER_CREDENTIALS_FULL_URI",
 ];
-const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
 
 /// Objects in a bucket of a store that speaks S3, below a prefix.
 ///
@@ -41,10 +47,10 @@ pub struct S3Objects {
     find_region: bool,
     patience: Patience,
     store: OnceCell<Arc<dyn ObjectStore>>,
+    /// Tags and versions of objects that were read in parts.
+    tags: Marks<(Option<String>, Option<String>)>,
     requests: Semaphore,
-    forbids_missing: OnceCell<bool>,
-    /// Whether any answer was other than a refusal.
-    granted: AtomicBool,
+    refusals: Refusals,
 }
 
 impl S3Objects {
@@ -95,9 +101,9 @@ impl S3Objects {
             find_region,
             patience,
             store: OnceCell::new(),
+            tags: Marks::default(),
             requests: Semaphore::new(REQUESTS),
-            forbids_missing: OnceCell::new(),
-            granted: AtomicBool::new(false),
+            refusals: Refusals::default(),
         };
         objects.build(None)?;
         Ok(objects)
@@ -117,6 +123,7 @@ impl S3Objects {
         };
         let mut builder = AmazonS3Builder::new()
             .with_client_options(client)
+            .with_http_connector(told::Connector)
             .with_retry(retry);
         for (key, value) in &self.settings {
             builder = builder.with_config(*key, value);
@@ -163,25 +170,25 @@ impl S3Objects {
         {
             return Ok(Some(Bytes::new()));
         }
-        match self
-            .patience
-            .attempts(self, key, || self.attempt(key, &part))
-            .await?
-        {
-            Found::Object(bytes) => {
-                self.granted.store(true, Ordering::Relaxed);
-                Ok(Some(bytes))
-            }
-            Found::Nothing => {
-                self.granted.store(true, Ordering::Relaxed);
-                Ok(None)
-            }
-            Found::Forbidden if self.forbids_missing().await? => Ok(None),
-            Found::Forbidden => Err(ObjectError::Denied {
-                advice: self.advice(),
-                location: self.location(key),
-            }),
-        }
+        let found = self.ask(key, &part).await?;
+        let other = |key: String| -> BoxFuture<'_, _> {
+            Box::pin(async move { self.ask(&key, &Part::Range(0..1)).await })
+        };
+        let location = self.location(key);
+        let settled = self.refusals.settle(key, found, &location, other);
+        let advice = match settled.await? {
+            Ok(bytes) => return Ok(Some(bytes)),
+            Err(Refusal::Missing) => return Ok(None),
+            Err(Refusal::Denied) => self.advice(),
+            Err(Refusal::Expired) => EXPIRED,
+        };
+        Err(ObjectError::Denied { advice, location })
+    }
+
+    async fn ask(&self, key: &str, part: &Part) -> Result<Found, ObjectError> {
+        self.patience
+            .attempts(self, key, || self.attempt(key, part))
+            .await
     }
 
     fn advice(&self) -> &'static str {
@@ -190,24 +197,6 @@ impl S3Objects {
         } else {
             "check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and what they allow in this bucket"
         }
-    }
-
-    async fn forbids_missing(&self) -> Result<bool, ObjectError> {
-        let ask = async || {
-            let part = Part::Range(0..1);
-            let asked = self
-                .patience
-                .attempts(self, NOBODYS, || self.attempt(NOBODYS, &part));
-            let forbids = matches!(asked.await?, Found::Forbidden);
-            if forbids {
-                let location = &self.location;
-                log::warn!(
-                    "forbidden objects are taken for missing ones, as all missing ones are forbidden: {location}"
-                );
-            }
-            Ok(forbids)
-        };
-        self.forbids_missing.get_or_try_init(ask).await.copied()
     }
 
     async fn attempt(&self, key: &str, part: &Part) -> Result<Found, Failure> {
@@ -232,7 +221,8 @@ impl S3Objects {
                 location: self.location(key),
             })
         };
-        let answer = match store.get_opts(&path, options).await {
+        let (answer, told) = told::listen(store.get_opts(&path, options)).await;
+        let answer = match answer {
             Ok(answer) => answer,
             Err(Error::NotFound { source, .. }) => {
                 let source = super::http::chain(&*source);
@@ -245,9 +235,8 @@ impl S3Objects {
                 }
                 return Ok(Found::Nothing);
             }
-            Err(Error::PermissionDenied { .. } | Error::Unauthenticated { .. }) => {
-                return Ok(Found::Forbidden);
-            }
+            Err(Error::PermissionDenied { .. }) => return Ok(Found::Forbidden),
+            Err(Error::Unauthenticated { .. }) => return Ok(Found::Unknown),
             Err(error) => {
                 let reason = super::http::chain(&error);
                 // Known in words only, among which are addresses; the conformance suite notices if these change.
@@ -256,10 +245,16 @@ impl S3Objects {
                 return match part {
                     Part::Range(range) if beyond => Err(too_short(range.clone())),
                     Part::Last(_) if beyond => Ok(Found::Object(Bytes::new())),
-                    _ => Err(Failure::again(reason)),
+                    _ => Err(Failure::Again {
+                        reason,
+                        wait: told.wait,
+                    }),
                 };
             }
         };
+        if told.is_part && matches!(part, Part::Whole { .. }) {
+            return Err(Failure::again("a part was sent for the whole"));
+        }
         if let Part::Whole { most } = part
             && answer.meta.size > *most
         {
@@ -278,16 +273,35 @@ impl S3Objects {
                 Failure::again(format!("bytes {sent:?} were sent for {wanted:?}"))
             });
         }
-        let bytes = answer.bytes().await;
-        let bytes = bytes.map_err(|error| Failure::again(super::http::chain(&error)))?;
-        let expected = sent.end.saturating_sub(sent.start);
-        if bytes.len() as u64 == expected {
-            Ok(Found::Object(bytes))
-        } else {
-            let count = bytes.len();
-            Err(Failure::again(format!(
-                "{count} bytes came instead of {expected}"
-            )))
+        let meta = &answer.meta;
+        let mark = (meta.e_tag.as_deref().and_then(strong), meta.version.clone());
+        let mark = (mark != (None, None)).then_some(mark);
+        let same = self.tags.check(key, part, mark, || self.location(key));
+        same.map_err(Failure::Final)?;
+        self.body(answer).await.map(Found::Object)
+    }
+
+    /// As many bytes as were announced, and no more than these.
+    async fn body(&self, answer: GetResult) -> Result<Bytes, Failure> {
+        let expected = answer.range.end.saturating_sub(answer.range.start);
+        let (mut body, pace) = (answer.into_stream(), Pace::new(self.patience));
+        let mut bytes = Vec::new();
+        while let Some(more) = self.patience.idle(body.next()).await? {
+            let more = more.map_err(|error| Failure::again(super::http::chain(&error)))?;
+            bytes.extend_from_slice(&more);
+            if bytes.len() as u64 > expected {
+                return Err(Failure::again(format!(
+                    "more than the {expected} bytes came that were announced"
+                )));
+            }
+            pace.check(bytes.len() as u64)?;
+        }
+        match bytes.len() as u64 == expected {
+            true => Ok(bytes.into()),
+            false => Err(Failure::again(format!(
+                "{} bytes came instead of {expected}",
+                bytes.len()
+            ))),
         }
     }
 }
@@ -312,17 +326,10 @@ impl Objects for S3Objects {
     }
 
     fn denied(&self) -> Option<&'static str> {
-        let forbidden = self.forbids_missing.get() == Some(&true);
-        (forbidden && !self.granted.load(Ordering::Relaxed)).then(|| self.advice())
+        self.refusals.all_refused().then(|| self.advice())
     }
 
     fn read_cost(&self) -> u64 {
         256 << 10
     }
-}
-
-enum Found {
-    Object(Bytes),
-    Nothing,
-    Forbidden,
 }

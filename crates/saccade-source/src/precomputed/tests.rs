@@ -1,6 +1,8 @@
 //! Volumes that tensorstore wrote (`fixtures/write.py`), voxel by voxel, and what is not right.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
+mod hostile;
+
 use std::path::{Path, PathBuf};
 
 use saccade_core::voxel_box::VoxelBox;
@@ -8,8 +10,8 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::conformance::{check_reading, check_volume};
-use crate::objects::{FolderObjects, HttpObjects, MemoryObjects, Patience};
-use crate::test_server::{Fault, TestServer};
+use crate::objects::{FolderObjects, HttpObjects, MemoryObjects};
+use crate::test_server::TestServer;
 
 const SIZE: UVec3 = UVec3::new(45, 31, 11);
 
@@ -314,55 +316,6 @@ async fn what_cannot_be_shown_is_refused_in_words() {
         .await
         .unwrap_err();
     assert!(error.to_string().contains("too large"), "{error}");
-}
-
-/// Whatever a server sends, there are the right voxels or an error that names the chunk.
-#[tokio::test]
-async fn damage_is_told_and_what_passes_is_read_again() {
-    let patience = Patience {
-        attempts: 2,
-        first_wait: std::time::Duration::from_millis(5),
-        ..Patience::default()
-    };
-    let id = ChunkId {
-        channel: 0,
-        level: 0,
-        chunk: UVec3::ZERO,
-    };
-    for (name, object) in [
-        ("png", "s0/0.shard"),
-        ("segments", "s0/0-16_0-13_0-5"),
-        ("segments_sharded", "s0/0.shard"),
-        ("jpeg", "s0/0-16_0-13_0-5"),
-    ] {
-        let server = TestServer::of_folder(&fixture(name)).await;
-        let open = async || {
-            let objects = HttpObjects::with_patience(&server.url, patience).unwrap();
-            PrecomputedSource::open(Arc::new(objects), name)
-                .await
-                .unwrap()
-        };
-        let good = open().await.read(id).await.unwrap();
-        for fault in [Fault::Garbage, Fault::Cut, Fault::Reset] {
-            let source = open().await;
-            server.fail_next([fault]);
-            assert!(source.read(id).await.unwrap() == good, "{name} {fault:?}");
-            let source = open().await;
-            server.fail_always(object, fault);
-            let error = source.read(id).await.unwrap_err();
-            let mut text = error.to_string();
-            let mut cause = std::error::Error::source(&error);
-            while let Some(error) = cause {
-                text += &format!(": {error}");
-                cause = error.source();
-            }
-            assert!(
-                text.contains("of level 0") && text.contains(object),
-                "{name} {fault:?}: {text}"
-            );
-            server.always.lock().unwrap().clear();
-        }
-    }
 }
 
 /// Copies of stores that compress in transport, behind a server that knows nothing of that.

@@ -5,10 +5,10 @@ use std::ops::Range;
 use bytes::Bytes;
 use futures::StreamExt as _;
 use reqwest::{Response, StatusCode, header};
-use web_time::Instant;
 
 use super::chain;
 use crate::objects::error::Failure;
+use crate::objects::retry::Pace;
 use crate::objects::{ObjectError, Part, Patience};
 
 /// Longest object that is read in whole because its server ignores ranges \[bytes\]. Of one, no more is kept than was asked for.
@@ -105,8 +105,7 @@ pub(super) async fn read(
     }
     let mut kept = Kept::new(part, partial);
     let mut body = answer.bytes_stream();
-    #[expect(clippy::disallowed_methods, reason = "web_time's, which browsers have")]
-    let begun = Instant::now();
+    let pace = Pace::new(patience);
     while let Some(more) = patience.idle(body.next()).await? {
         let more = more.map_err(|error| Failure::again(chain(&error.without_url())))?;
         kept.add(&more);
@@ -116,14 +115,7 @@ pub(super) async fn read(
         if kept.come > most {
             return Err(too_long());
         }
-        let seconds = begun.elapsed().saturating_sub(patience.idle).as_secs_f64();
-        let least = seconds * f64::from(patience.slowest);
-        if (kept.come as f64) < least {
-            let count = kept.come;
-            return Err(Failure::again(format!(
-                "no more than {count} bytes came in time"
-            )));
-        }
+        pace.check(kept.come)?;
     }
     let count = kept.come;
     let expected = must.or(told.filter(|_| !cut_by_us));

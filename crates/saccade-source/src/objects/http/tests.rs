@@ -1,8 +1,12 @@
 //! What becomes of the answers of a server that does not always do its work.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
+mod refused;
+mod replaced;
+
 use std::time::Duration;
 
+use super::super::refusals::NOBODYS;
 use super::super::{FolderObjects, MemoryObjects, S3Objects, conformance};
 use super::*;
 use crate::test_server::{Fault, TestServer};
@@ -21,14 +25,8 @@ fn of(server: &TestServer) -> HttpObjects {
     HttpObjects::with_patience(&server.url, patience()).unwrap()
 }
 
-/// The same objects by S3's requests, which differ in paths only.
 fn s3_of(server: &TestServer) -> S3Objects {
-    let endpoint = server.url.trim_end_matches("/sub").to_owned();
-    let settings = [
-        ("AWS_ENDPOINT_URL".to_owned(), endpoint),
-        ("AWS_REGION".to_owned(), "us-east-1".to_owned()),
-    ];
-    S3Objects::with_settings(&"s3://sub".parse().unwrap(), settings, patience()).unwrap()
+    server.s3(patience())
 }
 
 #[tokio::test]
@@ -149,33 +147,6 @@ async fn what_does_not_pass_is_told_at_once() {
 }
 
 #[tokio::test]
-async fn forbidden_is_missing_only_where_all_that_is_missing_is_forbidden() {
-    let server = TestServer::start(conformance::objects()).await;
-    server.fail_always("ten", Fault::Status("403 Forbidden"));
-    for store in [&of(&server) as &dyn Objects, &s3_of(&server)] {
-        let error = ten(store).await.unwrap_err();
-        let named = error.to_string();
-        assert!(
-            named.contains("access is denied") && named.contains("ten"),
-            "{named}"
-        );
-    }
-    *server.missing.lock().unwrap() = "403 Forbidden";
-    for store in [&of(&server) as &dyn Objects, &s3_of(&server)] {
-        let before = server.asked(NOBODYS);
-        for key in ["none", "a/none", "a/b/ten"] {
-            let got = store.read(key, Part::Last(3)).await;
-            assert!(matches!(got, Ok(None)), "{key}: {got:?}");
-        }
-        assert_eq!(server.asked(NOBODYS), before + 1, "it is asked once");
-        assert!(store.denied().is_some(), "all was forbidden so far");
-        let whole = store.read(".zattrs", Part::Whole { most: 9 }).await;
-        assert_eq!(whole.unwrap().as_deref(), Some(&b"{}"[..]));
-        assert_eq!(store.denied(), None, "something may be read");
-    }
-}
-
-#[tokio::test]
 async fn requests_are_limited_and_end_with_their_readers() {
     let server = TestServer::start(conformance::objects()).await;
     *server.latency.lock().unwrap() = Duration::from_millis(30);
@@ -199,34 +170,6 @@ async fn requests_are_limited_and_end_with_their_readers() {
     panic!("the connection is still open");
 }
 
-/// A shard whose index is of one file and whose chunks are of another is no shard.
-#[tokio::test]
-async fn parts_are_of_one_object_as_far_as_the_server_tells() {
-    let server = TestServer::start(conformance::objects()).await;
-    let store = of(&server);
-    let tagged = |tag| *server.tag.lock().unwrap() = tag;
-    tagged(Some("\"one\""));
-    store.read("a/b/ten", Part::Last(3)).await.unwrap();
-    ten(&store).await.unwrap();
-    tagged(Some("\"two\""));
-    let error = ten(&store).await.unwrap_err();
-    let named = error.to_string();
-    assert!(matches!(error, ObjectError::Replaced { .. }) && !error.is_transient());
-    assert!(
-        named.contains("a/b/ten") && named.contains("open the image again"),
-        "{named}"
-    );
-    let others = store.read("c/long", Part::Range(0..4)).await;
-    assert!(others.is_ok(), "tags are each object's own: {others:?}");
-    let whole = store.read("a/b/ten", Part::Whole { most: 10 }).await;
-    assert!(whole.is_ok(), "all of it is of one object: {whole:?}");
-    ten(&of(&server)).await.unwrap();
-    for nothing_told in [None, Some("W/\"three\"")] {
-        tagged(nothing_told);
-        assert!(ten(&store).await.is_ok(), "{nothing_told:?}");
-    }
-}
-
 #[tokio::test]
 async fn s3_waits_for_what_passes() {
     let named = ("c/416/ten".to_owned(), Bytes::from_static(b"0123456789"));
@@ -247,6 +190,58 @@ async fn s3_waits_for_what_passes() {
     }
     let beyond = s3_of(&server).read("a/b/ten", Part::Range(5..11)).await;
     assert!(matches!(beyond, Err(ObjectError::TooShort { .. })));
+}
+
+/// What a store asks for counts, and so does what readers can bear.
+#[tokio::test]
+async fn stores_that_ask_for_a_pause_get_it_up_to_a_bound() {
+    let server = TestServer::start(conformance::objects()).await;
+    let waited = async |patience: Patience, status: &'static str, way: usize| {
+        server.fail_next([Fault::Status(status)]);
+        let begun = web_time::SystemTime::now();
+        let got = ten(&*server.stores(patience)[way]).await;
+        assert_eq!(got.unwrap().as_deref(), Some(&b"234567"[..]), "{status}");
+        begun.elapsed().unwrap()
+    };
+    let long = Patience {
+        longest_wait: Duration::from_secs(3),
+        ..patience()
+    };
+    for way in 0..2 {
+        for status in ["429 Slow", "503 Slow"] {
+            let asked = match status {
+                "429 Slow" => "429 Slow\r\nretry-after: 1",
+                _ => "503 Slow\r\nretry-after: 1",
+            };
+            let paused = waited(long, asked, way).await;
+            assert!(
+                paused >= Duration::from_secs(1),
+                "{way} {asked}: {paused:?}"
+            );
+            let hurried = waited(long, status, way).await;
+            assert!(hurried < Duration::from_secs(1), "{way}: {hurried:?}");
+        }
+        let hour = "503 Slow\r\nretry-after: 3600";
+        let bounded = waited(patience(), hour, way).await;
+        assert!(bounded < Duration::from_secs(1), "{way}: {bounded:?}");
+    }
+}
+
+/// What is longer than was told is not collected to the end.
+#[tokio::test]
+async fn s3_reads_no_more_than_was_announced() {
+    let server = TestServer::start(conformance::objects()).await;
+    for by in [3, 8 << 20] {
+        server.fail_next([Fault::Longer(by)]);
+        let got = ten(&s3_of(&server)).await;
+        assert_eq!(got.unwrap().as_deref(), Some(&b"234567"[..]));
+        server.fail_next([Fault::Longer(by); 3]);
+        let named = ten(&s3_of(&server)).await.unwrap_err().to_string();
+        assert!(
+            named.contains("more than the 6 bytes") && named.contains("a/b/ten"),
+            "{named}"
+        );
+    }
 }
 
 #[test]

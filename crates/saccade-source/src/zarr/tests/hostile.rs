@@ -1,6 +1,7 @@
 //! Images behind servers that fail, lie, or are slow.
 
 use std::error::Error as _;
+use std::fs;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -11,7 +12,7 @@ use serde_json::{Value, json};
 
 use super::ZarrSource;
 use super::written::{read_all, version_3, write};
-use crate::objects::{HttpObjects, Patience};
+use crate::objects::{FolderObjects, HttpObjects, Objects, Patience};
 use crate::test_server::{Fault, TestServer};
 use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
 
@@ -47,10 +48,12 @@ async fn server(shard: [u32; 3], codecs: &Value) -> (Arc<TestServer>, Vec<u16>) 
 }
 
 async fn open(server: &TestServer) -> ZarrSource {
-    let objects = HttpObjects::with_patience(&server.url, patience()).unwrap();
-    ZarrSource::open(Arc::new(objects), "image.zarr")
-        .await
-        .unwrap()
+    let [http, _] = server.stores(patience());
+    open_of(http).await
+}
+
+async fn open_of(objects: Arc<dyn Objects>) -> ZarrSource {
+    ZarrSource::open(objects, "image.zarr").await.unwrap()
 }
 
 fn id(x: u32) -> ChunkId {
@@ -112,25 +115,36 @@ async fn neighbours_in_a_shard_come_together_and_once() {
 
 #[tokio::test]
 async fn what_passes_is_read_again_and_what_stays_names_the_chunk() {
-    let (server, _) = server([4, 33, 40], &blosc()).await;
-    let good = open(&server).await.read(id(0)).await.unwrap();
+    let by_way = async |way| {
+        let (server, _) = server([4, 33, 40], &blosc()).await;
+        what_passes_is_read_again(&server, way).await;
+    };
+    tokio::join!(by_way(0), by_way(1));
+}
+
+async fn what_passes_is_read_again(server: &TestServer, way: usize) {
+    let open = async || open_of(server.stores(patience())[way].clone()).await;
+    let good = open().await.read(id(0)).await.unwrap();
     let faults = [
         (Fault::Status("429 Too Many Requests"), true),
+        (Fault::Status("500 Oops"), true),
         (Fault::Status("503 Slow Down\r\nretry-after: 0"), true),
         (Fault::Reset, true),
         (Fault::Cut, true),
         (Fault::WrongLength, true),
+        (Fault::OtherPart, true),
         (Fault::Stall, true),
+        (Fault::Drip, true),
         (Fault::Garbage, false),
         (Fault::Longer(-3), false),
         (Fault::Longer(7), false),
     ];
     for (fault, transient) in faults {
-        let source = open(&server).await;
+        let source = open().await;
         server.fail_next([fault]);
         assert!(source.read(id(0)).await.unwrap() == good, "{fault:?}");
 
-        let source = open(&server).await;
+        let source = open().await;
         server.fail_always("0/c/1/0/0", fault);
         let error = source.read(id(0)).await.unwrap_err();
         let named = told(&error);
@@ -138,7 +152,7 @@ async fn what_passes_is_read_again_and_what_stays_names_the_chunk() {
             named.contains("chunk [1, 0, 0] of level 0"),
             "{fault:?}: {named}"
         );
-        assert!(named.contains("/sub/0/c/1/0/0"), "{fault:?}: {named}");
+        assert!(named.contains("sub/0/c/1/0/0"), "{fault:?}: {named}");
         assert_eq!(error.is_transient(), transient, "{fault:?}: {named}");
         // Voxels of other chunks are not affected: x from 64 on is in another one.
         assert!(
@@ -171,6 +185,122 @@ async fn missing_is_empty_and_forbidden_is_told() {
     );
 }
 
+/// What was not stored is 0; what is not let through any more is not.
+#[tokio::test]
+async fn a_login_that_runs_out_makes_no_holes() {
+    for (status, way) in [
+        ("403 Forbidden", 0),
+        ("403 Forbidden", 1),
+        ("401 Unauthorized", 0),
+        ("401 Unauthorized", 1),
+    ] {
+        let (server, _) = server([4, 33, 40], &blosc()).await;
+        *server.missing.lock().unwrap() = "403 Forbidden";
+        server.objects.lock().unwrap().remove("0/c/0/0/1");
+        let store = server.stores(patience())[way].clone();
+        let holed = open_of(store.clone()).await.read(id(0)).await.unwrap();
+        assert!(matches!(holed, Chunk::Voxels(_)));
+        // One that has read nothing of it so far.
+        let source = open_of(store).await;
+        server.fail_always("", Fault::Status(status));
+        let named = told(&source.read(id(1)).await.unwrap_err());
+        assert!(
+            named.contains("access is denied") && named.contains("run out"),
+            "{named}"
+        );
+        server.always.lock().unwrap().clear();
+        let seen = source.read(id(1)).await.unwrap();
+        assert!(matches!(seen, Chunk::Voxels(_)), "nothing was remembered");
+        let fresh = open_of(server.stores(patience())[way].clone()).await;
+        assert!(fresh.read(id(0)).await.unwrap() == holed);
+    }
+}
+
+/// Two chunks in a shard, as they are, and in the other order.
+fn raw_shard(values: [u8; 2], swapped: bool) -> Bytes {
+    const LENGTH: usize = 4 * 64 * 64;
+    let mut places = [0, LENGTH as u64];
+    let mut shard = values.map(|value| vec![value; LENGTH]);
+    if swapped {
+        places.reverse();
+        shard.reverse();
+    }
+    let mut shard = shard.concat();
+    for place in places {
+        shard.extend(place.to_le_bytes());
+        shard.extend((LENGTH as u64).to_le_bytes());
+    }
+    shard.into()
+}
+
+/// Nothing of a raw shard tells where its chunks end but its index, which is kept.
+#[tokio::test]
+async fn a_shard_that_is_replaced_is_not_read_by_its_old_index() {
+    let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
+    let array = json!({"zarr_format": 3, "node_type": "array", "shape": [4, 64, 128], "data_type": "uint8",
+        "fill_value": 0, "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [4, 64, 128]}},
+        "chunk_key_encoding": {"name": "default"}, "codecs": [{"name": "sharding_indexed", "configuration": {
+        "chunk_shape": [4, 64, 64], "codecs": [bytes], "index_codecs": [bytes]}}]});
+    let group = json!({"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"multiscales": [{
+        "axes": [{"name": "z"}, {"name": "y"}, {"name": "x"}], "datasets": [{"path": "0"}]}]}}});
+    let shard = "0/c/0/0/0";
+    let objects = [
+        ("zarr.json", group.to_string().into()),
+        ("0/zarr.json", array.to_string().into()),
+        (shard, raw_shard([1, 2], false)),
+    ];
+    let folder = tempfile::tempdir().unwrap();
+    fs::create_dir_all(folder.path().join("0/c/0/0")).unwrap();
+    let server = TestServer::start(objects.map(|(key, bytes)| (key.to_owned(), bytes))).await;
+    let put = |bytes: Bytes, tag| {
+        // Another file in its place, as who writes carefully does it.
+        let file = folder.path().join(shard);
+        fs::write(file.with_extension("new"), &bytes).unwrap();
+        fs::rename(file.with_extension("new"), file).unwrap();
+        server
+            .objects
+            .lock()
+            .unwrap()
+            .insert(shard.to_owned(), bytes);
+        *server.tag.lock().unwrap() = Some(tag);
+    };
+    for (key, bytes) in server.objects.lock().unwrap().iter() {
+        fs::write(folder.path().join(key), bytes).unwrap();
+    }
+    let [http, s3] = server.stores(patience());
+    let first = |chunk: &Chunk| match chunk {
+        Chunk::Voxels(bytes) => bytes[0],
+        Chunk::Empty => 0,
+    };
+    let stores: [Arc<dyn Objects>; 3] = [http, s3, Arc::new(FolderObjects::new(folder.path()))];
+    for (n, store) in stores.into_iter().enumerate() {
+        for replaced in [false, true] {
+            // Tags are remembered by the store, which is opened once.
+            put(raw_shard([1, 2], false), "\"one\"");
+            let store: Arc<dyn Objects> = match (n, replaced) {
+                (_, false) => store.clone(),
+                (2, true) => Arc::new(FolderObjects::new(folder.path())),
+                (way, true) => server.stores(patience())[way].clone(),
+            };
+            let source = open_of(store).await;
+            assert_eq!(first(&source.read(id(0)).await.unwrap()), 1);
+            if replaced {
+                put(raw_shard([3, 4], true), "\"two\"");
+            }
+            let got = source.read(id(1)).await;
+            if !replaced {
+                assert_eq!(first(&got.unwrap()), 2, "store {n}");
+                continue;
+            }
+            let named = told(&got.unwrap_err());
+            assert!(
+                named.contains("replaced") && named.contains(shard),
+                "store {n}: {named}"
+            );
+        }
+    }
+}
+
 #[tokio::test]
 async fn bombs_are_refused() {
     let codecs =
@@ -182,6 +312,15 @@ async fn bombs_are_refused() {
     let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     std::io::Write::write_all(&mut gzip, &zeros).unwrap();
     let gzip = gzip.finish().unwrap();
+    let mut zlib = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+    std::io::Write::write_all(&mut zlib, &zeros).unwrap();
+    let zlib = zlib.finish().unwrap();
+    // One that says how much it is, one that says more, and one that says less.
+    let block = lz4_flex::block::compress(&zeros);
+    let lz4 = |length: u32| [&length.to_le_bytes()[..], &block].concat();
+    let whole = u32::try_from(zeros.len()).unwrap();
+    let lz4s = [lz4(whole), lz4(u32::MAX), lz4(2 * 4 * 33 * 40)];
+    let numcodecs = |name: &str| json!({"name": format!("numcodecs.{name}"), "configuration": {}});
     let mut blosc_header = vec![2, 1, 1, 2];
     for number in [1 << 30, 1 << 20, 20_u32] {
         blosc_header.extend(number.to_le_bytes());
@@ -189,13 +328,25 @@ async fn bombs_are_refused() {
     blosc_header.extend([0; 4]);
     let zstd_codec = json!({"name": "zstd", "configuration": {"level": 1, "checksum": false}});
     let gzip_codec = json!({"name": "gzip", "configuration": {"level": 1}});
-    for (packer, bomb) in [
+    let bombs = [
         (zstd_codec.clone(), zstd),
         (zstd_codec, hidden),
         (gzip_codec, gzip),
+        (numcodecs("zlib"), zlib),
         (blosc()[1].clone(), blosc_header),
-    ] {
-        let (server, _) = server([4, 33, 40], &codecs(packer.clone())).await;
+    ];
+    let lz4s = lz4s.map(|bomb| (numcodecs("lz4"), bomb));
+    for (packer, bomb) in bombs.into_iter().chain(lz4s) {
+        // The other library, which writes the image, does not know all of them.
+        let (server, _) = server([4, 33, 40], &blosc()).await;
+        let array: Bytes = version_3("uint16", [4, 33, 40], &codecs(packer.clone()))
+            .to_string()
+            .into();
+        server
+            .objects
+            .lock()
+            .unwrap()
+            .insert("0/zarr.json".to_owned(), array);
         let source = open(&server).await;
         server
             .objects

@@ -1,0 +1,178 @@
+//! What it means that a store refuses an object: that it may not be read, or that there is none.
+//!
+//! Stores that do not let their readers list what there is refuse whatever they do not have, so that of most
+//! sparse images there are refusals without end. A login that has run out looks the same, and what it hides is not
+//! empty. So each refusal is judged by what the store says *after* it: an object that could be read before and still
+//! can shows that the login was good when the refusal came. Refusals that came before the question share its answer.
+
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use bytes::Bytes;
+use tokio::sync::Mutex;
+
+use super::ObjectError;
+use crate::maybe_send::BoxFuture;
+
+/// Names an object that nobody has.
+pub(super) const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
+
+/// What a store answers to one question.
+#[derive(Debug)]
+pub(super) enum Found {
+    Object(Bytes),
+    Nothing,
+    /// Whoever asks may not read it, or there is none.
+    Forbidden,
+    /// Whoever asks is not known, or not any more. Never a way to say that there is none.
+    Unknown,
+}
+
+/// Why an object is not there to read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Refusal {
+    /// There is none.
+    Missing,
+    /// It may not be read.
+    Denied,
+    /// Nothing may be read any more.
+    Expired,
+}
+
+/// How to mend [`Refusal::Expired`].
+pub(super) const EXPIRED: &str = "what could be read before is refused now; the login, or the token in the address, may have run out: \
+     renew it and open the image again";
+
+/// What a store refused so far.
+#[derive(Debug, Default)]
+pub(super) struct Refusals {
+    /// Whether any answer was other than a refusal.
+    heard: AtomicBool,
+    /// Whether an object that nobody has was refused.
+    forbids_missing: AtomicBool,
+    /// The first object that was read.
+    granted: OnceLock<String>,
+    /// Judgements that were begun.
+    begun: AtomicU64,
+    judged: Mutex<Judged>,
+}
+
+#[derive(Debug, Default)]
+struct Judged {
+    /// Number of the newest judgement, and what it was; or attempts and reason, where it failed.
+    last: Option<(u64, Result<Refusal, (u32, String)>)>,
+    /// Whether objects that nobody has are refused, and whether the login was good when it was asked.
+    forbids: Option<(bool, bool)>,
+}
+
+impl Refusals {
+    /// The object, or `None` if there is none, of what a store answers; `ask` asks for another one.
+    pub(super) async fn settle<'a>(
+        &self,
+        key: &str,
+        found: Found,
+        location: &str,
+        ask: impl Fn(String) -> BoxFuture<'a, Result<Found, ObjectError>>,
+    ) -> Result<Result<Bytes, Refusal>, ObjectError> {
+        match found {
+            Found::Object(bytes) => {
+                self.heard.store(true, Ordering::Relaxed);
+                self.granted.get_or_init(|| key.to_owned());
+                return Ok(Ok(bytes));
+            }
+            Found::Nothing => {
+                self.heard.store(true, Ordering::Relaxed);
+                return Ok(Err(Refusal::Missing));
+            }
+            Found::Forbidden => {}
+            Found::Unknown => {
+                let expired = self.granted.get().is_some();
+                return Ok(Err(if expired {
+                    Refusal::Expired
+                } else {
+                    Refusal::Denied
+                }));
+            }
+        }
+        // What is begun from here on is begun after the refusal.
+        let before = self.begun.load(Ordering::SeqCst);
+        let mut judged = self.judged.lock().await;
+        match &judged.last {
+            Some((number, Ok(refusal))) if *number > before => return Ok(Err(*refusal)),
+            Some((number, Err((attempts, reason)))) if *number > before => {
+                return Err(ObjectError::Unavailable {
+                    attempts: *attempts,
+                    reason: reason.clone(),
+                    location: location.to_owned(),
+                });
+            }
+            _ => {}
+        }
+        let number = self.begun.fetch_add(1, Ordering::SeqCst) + 1;
+        let result = self.judge(&mut judged.forbids, location, ask).await;
+        let kept = match &result {
+            Ok(refusal) => Ok(*refusal),
+            Err(ObjectError::Unavailable {
+                attempts, reason, ..
+            }) => Err((*attempts, reason.clone())),
+            Err(error) => Err((1, error.without_place())),
+        };
+        judged.last = Some((number, kept));
+        result.map(Err)
+    }
+
+    async fn judge<'a>(
+        &self,
+        forbids: &mut Option<(bool, bool)>,
+        location: &str,
+        ask: impl Fn(String) -> BoxFuture<'a, Result<Found, ObjectError>>,
+    ) -> Result<Refusal, ObjectError> {
+        let ask = async |key: &str| match ask(key.to_owned()).await {
+            // It was let through, whatever is wrong with it.
+            Err(
+                ObjectError::TooShort { .. }
+                | ObjectError::TooLong { .. }
+                | ObjectError::Replaced { .. },
+            ) => Ok(Found::Nothing),
+            asked => asked,
+        };
+        let granted = self.granted.get();
+        let known = match *forbids {
+            // Nothing is left to ask with before anything could be read.
+            Some((refused, _)) if granted.is_none() => Some(refused),
+            Some((true, true)) => Some(true),
+            _ => None,
+        };
+        let refused = match known {
+            Some(refused) => refused,
+            None => match ask(NOBODYS).await? {
+                Found::Unknown if granted.is_some() => return Ok(Refusal::Expired),
+                Found::Unknown => return Ok(Refusal::Denied),
+                Found::Forbidden => true,
+                Found::Object(_) | Found::Nothing => false,
+            },
+        };
+        if !refused {
+            *forbids = Some((false, true));
+            return Ok(Refusal::Denied);
+        }
+        // Asked last: what was refused before was refused to somebody who may read this.
+        if let Some(granted) = granted
+            && matches!(ask(granted).await?, Found::Forbidden | Found::Unknown)
+        {
+            return Ok(Refusal::Expired);
+        }
+        if !self.forbids_missing.swap(true, Ordering::Relaxed) {
+            log::warn!(
+                "forbidden objects are taken for missing ones, as all missing ones are forbidden, such as {location}"
+            );
+        }
+        *forbids = Some((true, granted.is_some()));
+        Ok(Refusal::Missing)
+    }
+
+    /// Whether all that was asked for so far was refused, even what there cannot be.
+    pub(super) fn all_refused(&self) -> bool {
+        self.forbids_missing.load(Ordering::Relaxed) && !self.heard.load(Ordering::Relaxed)
+    }
+}
