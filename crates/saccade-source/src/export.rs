@@ -10,8 +10,8 @@
 //! # What happens meanwhile
 //!
 //! The group's description, without which nobody takes the folder for an image, comes last. Until then
-//! `export.json` says what is being written; the same export begun again keeps the shards that are there, if the
-//! volume has not changed since; once the image is whole, its attribute `saccade` says the same, and how many shards there are. Begun
+//! `export.json` says what is being written; the same export begun again keeps the shards that are there, but for those in
+//! which the volume has changed since, as far as its source knows where; once the image is whole, its attribute `saccade` says the same, and how many shards there are. Begun
 //! once more, nothing is done where all of them are there; what is missing is exported again. What changes while it is exported is
 //! exported again, until all is of one state.
 //!
@@ -200,7 +200,7 @@ pub async fn export(
     // Listened to first: what changes from here on is in the stream.
     let mut changes = source.changes();
     let mut revision = source.revision();
-    let begun = begin(storage, &plan, revision).await?;
+    let begun = begin(&**source, storage, &plan, revision).await?;
 
     let mut all: Vec<ShardId> = plan.shards().collect();
     let mut state = ExportProgress {
@@ -287,7 +287,7 @@ pub async fn export(
 /// What there is of an export before it begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Begun {
-    /// Nothing, or nothing that is still right.
+    /// Nothing.
     Not,
     /// Shards that are still right.
     Partly,
@@ -329,8 +329,61 @@ async fn is_whole(
     Ok(arrays && shards == Some(found.count() as u64))
 }
 
+/// Removes shards of an attempt that began at another revision: those in which something has changed since, or all where
+/// nobody knows.
+async fn remove_outdated(
+    source: &dyn VolumeSource,
+    storage: &dyn Storage,
+    plan: &Plan,
+    since: Option<u64>,
+    now: u64,
+) -> Result<(), ExportError> {
+    let changes = match since.filter(|since| *since < now) {
+        Some(since) => source.changes_after(since).await,
+        None => None,
+    };
+    let touched: Option<BTreeSet<String>> = changes.map(|changes| {
+        let touched = { changes.iter() }.flat_map(|change| plan.touched(change.voxels));
+        touched.map(ShardId::key).collect()
+    });
+    let (mut removed, mut left) = (0_u64, 0_u64);
+    for name in there(storage, plan).await? {
+        if name.split('/').nth(1) != Some("c") {
+            continue;
+        }
+        if touched
+            .as_ref()
+            .is_none_or(|touched| touched.contains(&name))
+        {
+            storage.delete(&name).await?;
+            removed += 1;
+        } else {
+            left += 1;
+        }
+    }
+    let since = since.map_or("another revision".to_owned(), |since| {
+        format!("revision {since}")
+    });
+    match touched {
+        Some(_) => log::info!(
+            "the volume is at revision {now}, and the export was begun at {since}: {removed} of its shards are exported \
+             again, and {left} have not changed"
+        ),
+        None => log::warn!(
+            "the volume is at revision {now}, and the export was begun at {since}; what has changed in between is no longer \
+             known, so it begins anew, without the {removed} shards that were there"
+        ),
+    }
+    Ok(())
+}
+
 /// Says what is being written, unless all of it is there.
-async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<Begun, ExportError> {
+async fn begin(
+    source: &dyn VolumeSource,
+    storage: &dyn Storage,
+    plan: &Plan,
+    revision: u64,
+) -> Result<Begun, ExportError> {
     let ours = state_of(plan, revision);
     if let Some(begun) = json(storage, UNFINISHED).await? {
         if !plan::goes_on(&begun["export"], &ours["export"]) {
@@ -346,6 +399,11 @@ async fn begin(storage: &dyn Storage, plan: &Plan, revision: u64) -> Result<Begu
         }
         // It may have been whole but for the end of this object: no image while it is written anew.
         storage.delete(GROUP).await?;
+        let of = begun["revision"].as_u64();
+        remove_outdated(source, storage, plan, of, revision).await?;
+        // Not before these are gone: an attempt that ends here goes on from the revision that is told.
+        storage.write_durable(UNFINISHED, pretty(&ours)).await?;
+        return Ok(Begun::Partly);
     } else if let Some(group) = json(storage, GROUP).await? {
         let there = &group["attributes"][OURS];
         if !plan::goes_on(&there["export"], &ours["export"]) {

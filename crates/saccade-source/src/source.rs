@@ -211,6 +211,12 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
         0
     }
 
+    /// What has changed since a revision that the volume had, for those who read it then and come back: at least
+    /// these voxels. `None` where nobody knows (any more), so that anything may have.
+    fn changes_after(&self, _revision: u64) -> BoxFuture<'_, Option<Vec<Change>>> {
+        Box::pin(std::future::ready(None))
+    }
+
     /// What could not be read when it was looked at last and will not get better by itself, as far as this
     /// source knows and has looked.
     fn damage(&self) -> Vec<Damage> {

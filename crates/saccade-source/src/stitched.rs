@@ -357,6 +357,10 @@ impl VolumeSource for StitchedSource {
         self.inner.changes.revision()
     }
 
+    fn changes_after(&self, revision: u64) -> BoxFuture<'_, Option<Vec<Change>>> {
+        Box::pin(self.inner.changes_after(revision))
+    }
+
     fn damage(&self) -> Vec<Damage> {
         self.inner.builder.tiles().damaged().list()
     }

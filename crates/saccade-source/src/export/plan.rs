@@ -136,14 +136,30 @@ impl Plan {
         })
     }
 
-    /// Shards in which voxels of a box are, in any channel \[voxels of level 0\].
+    /// Shards in which voxels of a box are, in any channel \[voxels of level 0\]. Takes as long as they are many,
+    /// whatever the export's size.
     pub(super) fn touched(&self, voxels: VoxelBox) -> impl Iterator<Item = ShardId> {
-        let touched = move |planned: &PlannedLevel, shard: ShardId| {
+        let levels = self.levels.iter().enumerate().rev();
+        levels.flat_map(move |(level, planned)| {
             let of_level = self.volume.levels[planned.level as usize].box_from_voxels(voxels);
-            planned.voxels_of(shard.xyz()).intersects(of_level)
-        };
-        self.shards()
-            .filter(move |shard| touched(&self.levels[shard.level], *shard))
+            let part = of_level.intersection(planned.voxels);
+            // Shards are counted from the corner of what is exported.
+            let part = match part.is_empty() {
+                true => VoxelBox::EMPTY,
+                false => {
+                    VoxelBox::new(part.min - planned.voxels.min, part.max - planned.voxels.min)
+                }
+            };
+            let channels = 0..u32::try_from(self.channels.len()).unwrap_or(u32::MAX);
+            channels.flat_map(move |channel| {
+                let shards = part.cells(planned.shard);
+                shards.map(move |UVec3 { x, y, z }| ShardId {
+                    level,
+                    channel,
+                    zyx: [z, y, x],
+                })
+            })
+        })
     }
 
     /// What tells this export from others of the same place.
@@ -294,4 +310,62 @@ fn shard_size(size: UVec3, chunk: UVec3, dtype: Dtype) -> UVec3 {
         along[longest] = along[longest].div_ceil(2);
     }
     along * chunk
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn plan(extent: UVec3, chunk: UVec3, region: Option<VoxelBox>, finest: u32) -> Plan {
+        let mut volume = Volume::new("em", extent, DVec3::new(4.0, 4.0, 16.0)).unwrap();
+        volume.channels = ["a", "b"].map(Into::into).into();
+        volume.chunk = chunk;
+        let finest = finest.min(u32::try_from(volume.levels.len()).unwrap() - 1);
+        let options = ExportOptions {
+            region,
+            finest,
+            ..ExportOptions::default()
+        };
+        Plan::new(&Arc::new(volume), &options).unwrap()
+    }
+
+    fn any_box(within: u32) -> impl Strategy<Value = VoxelBox> {
+        let corner = || prop::array::uniform3(0..within);
+        (corner(), corner()).prop_map(|(one, other)| {
+            let (one, other) = (UVec3::from(one), UVec3::from(other));
+            VoxelBox::new(one.min(other), one.max(other))
+        })
+    }
+
+    proptest! {
+        /// Each that holds a voxel of the box, and no other.
+        #[test]
+        fn touched_are_those_that_hold_voxels_of_the_box(
+            region in any_box(150), changed in any_box(200), chunk in 1..9_u32, finest in 0..3_u32,
+        ) {
+            let whole = VoxelBox::of_size(UVec3::new(140, 90, 40));
+            let region = Some(region).filter(|region| region.intersects(whole));
+            let plan = plan(whole.max, UVec3::new(chunk, 3, 4), region, finest);
+            let holds = |shard: &ShardId| {
+                let planned = &plan.levels[shard.level];
+                let of_level = plan.volume.levels[planned.level as usize].box_from_voxels(changed);
+                planned.voxels_of(shard.xyz()).intersects(of_level)
+            };
+            let want: Vec<_> = plan.shards().filter(holds).collect();
+            prop_assert_eq!(plan.touched(changed).collect::<Vec<_>>(), want);
+        }
+    }
+
+    /// A tile of a volume of a thousand million shards.
+    #[test]
+    fn few_are_found_among_many() {
+        let plan = plan(UVec3::splat(1 << 20), UVec3::splat(64), None, 0);
+        let corner = UVec3::new(777_777, 123_456, 654_321);
+        let tile = VoxelBox::new(corner, corner + UVec3::new(4096, 4096, 1));
+        let touched = plan.touched(tile).count();
+        assert!((20..5000).contains(&touched), "{touched}");
+    }
 }

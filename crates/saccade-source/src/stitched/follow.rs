@@ -84,6 +84,36 @@ async fn catch_up(
 }
 
 impl Inner {
+    /// What has changed after a revision, as long as the catalog keeps it.
+    pub(super) async fn changes_after(&self, mut revision: u64) -> Option<Vec<Change>> {
+        let (catalog, name) = (self.builder.tiles().index().catalog(), &self.volume.name);
+        let mut all = Vec::new();
+        let known = async {
+            loop {
+                let changes = catalog.changes_after(name, revision).await?;
+                let Some(last) = changes.last() else {
+                    // None are kept at all where this is another one.
+                    return Ok(catalog.revision(name).await? == revision);
+                };
+                revision = last.revision;
+                // Which sections had their first tile or lost their last is not kept: each may have.
+                all.extend(changes.iter().map(|change| Change {
+                    revision: change.revision,
+                    voxels: self.builder.touched(change.voxels, true),
+                    reason: reason(change.reason),
+                }));
+            }
+        };
+        match known.await {
+            Ok(true) => Some(merged(all)),
+            Ok(false) => None,
+            Err::<_, CatalogError>(error) => {
+                log::info!("what has changed cannot be told: {error}");
+                None
+            }
+        }
+    }
+
     /// Away for longer than changes are kept: anything may be another.
     fn tell_missed(&self, revision: u64) {
         let voxels = VoxelBox::of_size(self.volume.extent());

@@ -123,6 +123,11 @@ impl TileIndex {
         })
     }
 
+    /// What it is an index of.
+    pub(super) fn catalog(&self) -> &Catalog {
+        &self.catalog
+    }
+
     /// The sections in a range that have a tile, ascending.
     pub fn acquired(&self, sections: Range<u32>) -> Vec<u32> {
         lock(&self.acquired).range(sections).copied().collect()

@@ -10,6 +10,7 @@ mod labels;
 mod load;
 mod options;
 mod oracle;
+mod since;
 
 use std::future::Future;
 use std::time::Duration;
