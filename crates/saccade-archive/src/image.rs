@@ -36,6 +36,8 @@ mod tiff;
 #[cfg(test)]
 mod tests;
 
+pub use self::tiff::pages::Pages;
+
 /// Largest width or height \[pixels\]: 12 levels above one sub-tile, whose sums fit 32 bits.
 pub const MAX_EDGE: u32 = 1 << 19;
 
@@ -287,7 +289,7 @@ impl ImageError {
 
 /// Decodes a TIFF, PNG or JPEG file, told apart by its first bytes, to grey of 8 bits.
 ///
-/// Only the first image of a file is read; alpha is ignored.
+/// Only the first image of a file is read, see [`Pages`] for others; alpha is ignored.
 ///
 /// # Errors
 ///

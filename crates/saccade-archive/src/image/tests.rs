@@ -12,6 +12,8 @@ use proptest::prelude::*;
 
 use super::{GrayImage, Image, ImageError, Wanted, decode, decode_as, decode_file, sniff};
 
+mod pages;
+
 /// Texture with odd sides: neighbours differ, yet it compresses.
 fn texture(width: u32, height: u32) -> GrayImage {
     let value = |x: u32, y: u32| (x * 7 + y * 13 + (x * y) % 11) as u8 | 1;

@@ -9,6 +9,7 @@ use tiff::tags::Tag;
 use tiff::{ColorType, TiffError};
 
 mod lzw;
+pub(super) mod pages;
 
 use super::sniff::{HEAD, broken, incomplete};
 use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, gray};
@@ -20,10 +21,15 @@ impl<T: Read + Seek> ReadSeek for T {}
 
 /// Decodes a file of `len` bytes, from its beginning on.
 pub(super) fn decode(
-    mut file: impl Read + Seek,
+    file: impl Read + Seek,
     len: u64,
     wanted: Wanted,
 ) -> Result<Image, ImageError> {
+    decode_page(&mut open(file, len)?, len, wanted)
+}
+
+/// Opens a file of `len` bytes, from its beginning on, at its first page.
+fn open<R: Read + Seek>(mut file: R, len: u64) -> Result<Decoder<R>, ImageError> {
     let mut head = Vec::new();
     let read = file.by_ref().take(HEAD).read_to_end(&mut head);
     read.and_then(|_| file.rewind())
@@ -35,10 +41,32 @@ pub(super) fn decode(
     limits.ifd_value_size = stored;
     limits.intermediate_buffer_size = stored;
     limits.decoding_buffer_size = stored.max(1 << 20);
-    let mut decoder = Decoder::new(file).map_err(sort)?.with_limits(limits);
+    Ok(Decoder::new(file).map_err(sort)?.with_limits(limits))
+}
+
+/// What a page says of its pixels, once it was found possible.
+struct Page {
+    width: u32,
+    height: u32,
+    /// Bits of a sample.
+    bits: u8,
+    channels: usize,
+    /// Bytes of a row.
+    row: usize,
+    /// Bytes of all rows.
+    len: usize,
+}
+
+/// Looks whether the page where the decoder is can be decoded from a file of `len` bytes, before memory is set aside
+/// for it.
+fn check_page(
+    decoder: &mut Decoder<impl Read + Seek>,
+    len: u64,
+    wanted: Wanted,
+) -> Result<Page, ImageError> {
     let (width, height) = decoder.dimensions().map_err(sort)?;
-    let pixels = wanted.check_size(width, height)?;
-    check_samples(&mut decoder)?;
+    wanted.check_size(width, height)?;
+    check_samples(decoder)?;
     let (channels, bits) = match decoder.colortype().map_err(sort)? {
         ColorType::Gray(bits @ (1 | 2 | 4 | 8 | 16)) => (1, bits),
         ColorType::RGB(bits @ (8 | 16)) => (3, bits),
@@ -62,22 +90,40 @@ pub(super) fn decode(
     if wanted.labels && channels > 1 {
         return Err(unsupported("labels in several channels"));
     }
-    check_data(&mut decoder, len)?;
+    check_data(decoder, len)?;
     let layout = decoder.image_buffer_layout().map_err(sort)?;
     // Rows begin on whole bytes.
     let row = (width as usize * channels * usize::from(bits)).div_ceil(8);
     if layout.len != row * height as usize || layout.complete_len != layout.len {
         return Err(unsupported("a TIFF of several planes"));
     }
-    check_ratio(stored, layout.len)?;
-    if let Some(plain) = lzw::unpacked(&mut decoder, layout.len)? {
+    check_ratio(usize::try_from(len).unwrap_or(usize::MAX), layout.len)?;
+    Ok(Page {
+        width,
+        height,
+        bits,
+        channels,
+        row,
+        len: layout.len,
+    })
+}
+
+/// Decodes the page where the decoder is.
+fn decode_page(
+    decoder: &mut Decoder<impl Read + Seek>,
+    len: u64,
+    wanted: Wanted,
+) -> Result<Image, ImageError> {
+    let page = check_page(decoder, len, wanted)?;
+    let (width, height, channels) = (page.width, page.height, page.channels);
+    if let Some(plain) = lzw::unpacked(decoder, page.len)? {
         let len = plain.len() as u64;
         // By name: a type that contains itself has no end.
         let plain: Box<dyn ReadSeek> = Box::new(io::Cursor::new(plain));
         return decode(plain, len, wanted);
     }
-    if bits == 16 {
-        let mut samples = allocate::<u16>(layout.len / 2)?;
+    if page.bits == 16 {
+        let mut samples = allocate::<u16>(page.len / 2)?;
         // In this machine's order of bytes.
         decoder
             .read_image_bytes(bytemuck::cast_slice_mut(&mut samples))
@@ -85,18 +131,18 @@ pub(super) fn decode(
         let image = gray((width, height), samples, channels, EXACT)?;
         return Ok(Image::Uint16(image));
     }
-    let mut samples = allocate::<u8>(layout.len)?;
+    let mut samples = allocate::<u8>(page.len)?;
     decoder.read_image_bytes(&mut samples).map_err(sort)?;
-    if bits < 8 {
-        let bits = usize::from(bits);
+    if page.bits < 8 {
+        let bits = usize::from(page.bits);
         // Spread over 0 to 255, exactly; labels stay the numbers that they are.
         let scale = if wanted.labels {
             1
         } else {
             u8::MAX / (u8::MAX >> (8 - bits))
         };
-        let mut voxels = allocate::<u8>(pixels)?;
-        unpack(&samples, row, width as usize, bits, scale, &mut voxels);
+        let mut voxels = allocate::<u8>(width as usize * height as usize)?;
+        unpack(&samples, page.row, width as usize, bits, scale, &mut voxels);
         return wanted.of_8(Gray::new(width, height, voxels));
     }
     wanted.of_8(gray((width, height), samples, channels, EXACT)?)

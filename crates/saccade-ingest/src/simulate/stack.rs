@@ -100,6 +100,16 @@ pub enum StackError {
         /// The section's file.
         path: PathBuf,
     },
+    /// A page of a file, after its first, is no 8-bit grey image.
+    #[error("page {page} of the stack is no usable image: {}", path.display())]
+    Page {
+        /// What is wrong, and how to mend it.
+        source: ImageError,
+        /// The page, from 1.
+        page: u32,
+        /// The file.
+        path: PathBuf,
+    },
     /// A section differs in size from the first.
     #[error(
         "a section has {got} pixels, but the first has {want}; a registered stack has sections of \

@@ -77,6 +77,157 @@ fn pages_of_a_tiff_are_stacks() {
     conformance::check(&*open(folder.path()).unwrap(), EXTENT, &values());
 }
 
+/// A TIFF of one directory per page, written by hand: each is its tags, as short numbers, and its data.
+fn pages_by_hand(pages: &[(&[(u16, u32)], &[u8])]) -> Vec<u8> {
+    let mut file = b"II\x2a\0\0\0\0\0".to_vec();
+    let mut link = 4;
+    for (tags, data) in pages {
+        let at = u32::try_from(file.len()).unwrap();
+        file.extend(*data);
+        let len = u32::try_from(data.len()).unwrap();
+        let mut tags = tags.to_vec();
+        tags.extend([(273, at), (279, len)]);
+        tags.sort_unstable();
+        let directory = u32::try_from(file.len()).unwrap();
+        file[link..link + 4].copy_from_slice(&directory.to_le_bytes());
+        file.extend(u16::try_from(tags.len()).unwrap().to_le_bytes());
+        for (tag, value) in tags {
+            file.extend(tag.to_le_bytes());
+            file.extend([4, 0, 1, 0, 0, 0]);
+            file.extend(value.to_le_bytes());
+        }
+        link = file.len();
+        file.extend([0; 4]);
+    }
+    file
+}
+
+/// Tags of an uncompressed page.
+fn plain(width: u32, height: u32, bits: u32) -> Vec<(u16, u32)> {
+    let tags = [width, height, bits, 1, 1, 1, height];
+    [256, 257, 258, 259, 262, 277, 278]
+        .into_iter()
+        .zip(tags)
+        .collect()
+}
+
+/// What is odd in a page is as in a file of its own: few bits, white that is zero, equal channels.
+#[test]
+fn odd_pages_are_sections_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("odd.tif");
+    let with = |bits, tag, value| {
+        let mut tags = plain(4, 1, bits);
+        tags.retain(|(known, _)| *known != tag);
+        tags.push((tag, value));
+        tags
+    };
+    let (bits, white) = (plain(4, 1, 1), with(8, 262, 0));
+    let mut rgb = with(8, 277, 3);
+    rgb.retain(|(tag, _)| *tag != 262);
+    rgb.push((262, 2));
+    let file = pages_by_hand(&[
+        (&plain(4, 1, 8), &[1, 2, 3, 4]),
+        (&bits, &[0b1010_0000]),
+        (&white, &[255, 254, 0, 1]),
+        (&rgb, &[7, 7, 7, 8, 8, 8, 9, 9, 9, 0, 0, 0]),
+    ]);
+    fs::write(&path, file).unwrap();
+    let stack = TiffPages::open(&path).unwrap();
+    let want = [1, 2, 3, 4, 255, 0, 255, 0, 0, 1, 255, 254, 7, 8, 9, 0];
+    conformance::check(&stack, UVec3::new(4, 1, 4), &want);
+
+    // Whatever is wrong with a later page is noticed before anything is decoded, and where it is.
+    let good = plain(4, 1, 8);
+    let refused = |page: &[(u16, u32)]| {
+        let file = pages_by_hand(&[(&good, &[1, 2, 3, 4]), (page, &[1, 2, 3, 4])]);
+        fs::write(&path, file).unwrap();
+        TiffPages::open(&path).unwrap_err()
+    };
+    let deep = refused(&plain(2, 1, 16));
+    let depth = matches!(
+        deep,
+        StackError::Page {
+            source: ImageError::Depth { bits: 16, .. },
+            page: 2,
+            ..
+        }
+    );
+    assert!(depth && deep.to_string().contains("page 2"), "{deep}");
+    let other = refused(&plain(2, 2, 8));
+    assert!(matches!(other, StackError::Size { .. }), "{other}");
+    let mut cut = plain(4, 1, 8);
+    cut.push((266, 2));
+    let reversed = refused(&cut);
+    assert!(matches!(reversed, StackError::Page { .. }), "{reversed}");
+}
+
+/// The pages of a file that claims gigapixels are refused before memory is set aside for them. Measured in a
+/// process of its own: other tests need memory too.
+#[test]
+#[cfg(target_os = "linux")]
+fn pages_that_are_bombs_are_refused() {
+    const NAME: &str = "simulate::stack::tests::pages_that_are_bombs_are_refused";
+    const BOMB: &str = "SACCADE_TEST_BOMB";
+    const CEILING: u64 = 64 << 20;
+    let resident = |key: &str| {
+        let status = fs::read_to_string("/proc/self/status").unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix(key));
+        let kib = line.unwrap().trim_matches([':', ' ', '\t']);
+        kib.trim_end_matches(" kB").parse::<u64>().unwrap() << 10
+    };
+    let took = |work: &mut dyn FnMut()| {
+        fs::write("/proc/self/clear_refs", "5").unwrap();
+        let before = resident("VmRSS");
+        work();
+        resident("VmHWM").saturating_sub(before)
+    };
+    if let Some(bomb) = std::env::var_os(BOMB) {
+        let control = took(&mut || drop(std::hint::black_box(vec![1_u8; 2 * CEILING as usize])));
+        assert!(control > CEILING, "the measure sees {control} bytes");
+        let took = took(&mut || {
+            let refused = match TiffPages::open(Path::new(&bomb)) {
+                Err(refused) => refused,
+                // What a page says of itself may be possible, and its data not.
+                Ok(stack) => stack
+                    .region(1, UVec2::ZERO, UVec2::ONE)
+                    .expect_err("it is no image"),
+            };
+            assert!(
+                matches!(refused, StackError::Image { .. } | StackError::Page { .. }),
+                "{refused}"
+            );
+        });
+        assert!(took < CEILING, "took {took} bytes to refuse");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bomb.tif");
+    let good = plain(4, 1, 8);
+    let pixels: (&[(u16, u32)], &[u8]) = (&good, &[1, 2, 3, 4]);
+    let deflated = |edge| {
+        let mut tags = plain(edge, edge, 8);
+        tags[3].1 = 8;
+        tags
+    };
+    for edge in [1 << 14, 1 << 16, 1 << 20] {
+        for tags in [plain(edge, edge, 8), plain(edge, edge, 16), deflated(edge)] {
+            let bomb: (&[(u16, u32)], &[u8]) = (&tags, &[7; 64]);
+            for pages in [[bomb, pixels], [pixels, bomb]] {
+                fs::write(&path, pages_by_hand(&pages)).unwrap();
+                let child = std::process::Command::new(std::env::current_exe().unwrap())
+                    .args([NAME, "--exact"])
+                    .env(BOMB, &path)
+                    .output()
+                    .unwrap();
+                let said = String::from_utf8_lossy(&child.stdout);
+                assert!(child.status.success(), "{edge}, {tags:?}: {said}");
+                assert!(said.contains("1 passed"), "{said}");
+            }
+        }
+    }
+}
+
 #[test]
 fn the_phantom_is_a_stack() {
     let nm = DVec3::new(9.0, 7.0, 31.0);
