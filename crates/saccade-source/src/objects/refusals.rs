@@ -57,10 +57,17 @@ pub(super) struct Refusals {
     judged: Mutex<Judged>,
 }
 
+/// Why nothing could be found out.
+#[derive(Debug)]
+struct Unjudged {
+    attempts: u32,
+    reason: String,
+}
+
 #[derive(Debug, Default)]
 struct Judged {
-    /// Number of the newest judgement, and what it was; or attempts and reason, where it failed.
-    last: Option<(u64, Result<Refusal, (u32, String)>)>,
+    /// Number of the newest judgement, and what it was.
+    last: Option<(u64, Result<Refusal, Unjudged>)>,
     /// Whether objects that nobody has are refused, and whether the login was good when it was asked.
     forbids: Option<(bool, bool)>,
 }
@@ -99,10 +106,10 @@ impl Refusals {
         let mut judged = self.judged.lock().await;
         match &judged.last {
             Some((number, Ok(refusal))) if *number > before => return Ok(Err(*refusal)),
-            Some((number, Err((attempts, reason)))) if *number > before => {
+            Some((number, Err(why))) if *number > before => {
                 return Err(ObjectError::Unavailable {
-                    attempts: *attempts,
-                    reason: reason.clone(),
+                    attempts: why.attempts,
+                    reason: why.reason.clone(),
                     location: location.to_owned(),
                 });
             }
@@ -110,14 +117,19 @@ impl Refusals {
         }
         let number = self.begun.fetch_add(1, Ordering::SeqCst) + 1;
         let result = self.judge(&mut judged.forbids, location, ask).await;
-        let kept = match &result {
-            Ok(refusal) => Ok(*refusal),
-            Err(ObjectError::Unavailable {
+        let kept = result.as_ref().map_err(|error| match error {
+            ObjectError::Unavailable {
                 attempts, reason, ..
-            }) => Err((*attempts, reason.clone())),
-            Err(error) => Err((1, error.without_place())),
-        };
-        judged.last = Some((number, kept));
+            } => Unjudged {
+                attempts: *attempts,
+                reason: reason.clone(),
+            },
+            error => Unjudged {
+                attempts: 1,
+                reason: error.without_place(),
+            },
+        });
+        judged.last = Some((number, kept.copied()));
         result.map(Err)
     }
 
