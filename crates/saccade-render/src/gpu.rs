@@ -166,6 +166,9 @@ impl Gpu {
     }
 
     pub(crate) fn ray_caster(&self) -> &RayCaster {
-        self.ray_caster.get_or_init(|| RayCaster::new(&self.device))
+        // Where the processor draws, another thread that compiles would slow down frames, which take long anyway.
+        let in_background = self.adapter.device_type != wgpu::DeviceType::Cpu;
+        let new = || RayCaster::new(&self.device, in_background);
+        self.ray_caster.get_or_init(new)
     }
 }

@@ -229,6 +229,39 @@ impl Variant {
     }
 }
 
+impl Variant {
+    /// Whether it draws what another does.
+    pub(crate) fn stands_in_for(self, other: Self) -> bool {
+        let alike = |v: Self| (v.mode, v.joined, v.false_colors);
+        alike(self) == alike(other) && self.slots >= other.slots && self.bounded >= other.bounded
+    }
+
+    /// Those that draw, or stand in for those that do, when the camera goes far away, as many channels as there are are
+    /// shown, or what is drawn of values changes.
+    pub(crate) fn likely_next(self, channels: usize) -> Vec<Self> {
+        let bounded = Self {
+            bounded: true,
+            ..self
+        };
+        let most = Self::new(channels.min(MOST_CHANNELS), 0, false, 0, false).slots;
+        let all = Self {
+            slots: most.max(self.slots),
+            ..bounded
+        };
+        let modes = [MODE_EMISSION_ABSORPTION, MODE_MAXIMUM, MODE_ISO_SURFACE];
+        let modes = modes.map(|mode| Self { mode, ..bounded });
+        let colors = [FALSE_NONE, FALSE_RESIDENCY, FALSE_LEVEL];
+        let colors = colors.map(|false_colors| Self {
+            false_colors,
+            ..bounded
+        });
+        let mut next = vec![bounded, all];
+        next.extend(modes);
+        next.extend(colors);
+        next
+    }
+}
+
 /// The ray-caster's source.
 pub(crate) fn ray_cast(variant: Variant) -> String {
     let Variant {
@@ -305,6 +338,49 @@ mod tests {
                 .unwrap_or_else(|e| panic!("{}", e.emit_to_string(&source)));
             let entries = module.entry_points.iter().map(|e| e.name.as_str());
             assert_eq!(entries.collect::<Vec<_>>(), ["main"]);
+        }
+    }
+
+    #[test]
+    fn variants_stand_in_for_those_that_need_less() {
+        let few = Variant::new(1, MODE_EMISSION_ABSORPTION, false, FALSE_NONE, false);
+        let many = Variant::new(3, MODE_EMISSION_ABSORPTION, false, FALSE_NONE, true);
+        assert!(many.stands_in_for(few) && few.stands_in_for(few) && !few.stands_in_for(many));
+        let far = Variant {
+            bounded: true,
+            ..few
+        };
+        assert!(far.stands_in_for(few) && !few.stands_in_for(far));
+        for other in [
+            Variant {
+                mode: MODE_MAXIMUM,
+                ..many
+            },
+            Variant {
+                joined: true,
+                ..many
+            },
+            Variant {
+                false_colors: FALSE_LEVEL,
+                ..many
+            },
+        ] {
+            assert!(!other.stands_in_for(few), "{other:?} draws something else");
+        }
+        // Whatever one of these changes is, something is there that draws it.
+        let next = few.likely_next(9);
+        let drawn = |wanted: Variant| next.iter().any(|v| v.stands_in_for(wanted));
+        let modes = [MODE_EMISSION_ABSORPTION, MODE_MAXIMUM, MODE_ISO_SURFACE];
+        for far in [false, true] {
+            assert!(
+                modes
+                    .iter()
+                    .all(|m| drawn(Variant::new(1, *m, false, FALSE_NONE, far)))
+            );
+            for channels in 1..10 {
+                let mode = MODE_EMISSION_ABSORPTION;
+                assert!(drawn(Variant::new(channels, mode, false, FALSE_NONE, far)));
+            }
         }
     }
 

@@ -79,7 +79,7 @@
 //!
 //! # What it does not do
 //!
-//! It fetches nothing, opens no window, starts no thread and reads no clock. Labels have no colours of their own yet: their
+//! It fetches nothing, opens no window, starts no thread but to compile shaders, and reads no clock. Labels have no colours of their own yet: their
 //! numbers are taken for shades. Transfer functions have one dimension.
 
 mod channel;

@@ -1,9 +1,18 @@
-//! The compiled ray-caster. Compiling takes a while, so all renderers of a device share one.
+//! The compiled ray-caster. Compiling takes a while, so all renderers of a device share one, and a frame does with a
+//! variant that is there while the one it wants is compiled elsewhere.
 
-use std::collections::HashMap;
-use std::sync::{Mutex, PoisonError};
+use std::collections::{HashMap, HashSet};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::layout::{FrameUniform, Variant, ray_cast};
+
+#[cfg(not(target_family = "wasm"))]
+#[path = "ray_caster/native.rs"]
+mod platform;
+#[cfg(target_family = "wasm")]
+#[path = "ray_caster/wasm.rs"]
+mod platform;
 
 /// Format of the picture: portable for storage, read as it is by windows.
 pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
@@ -12,29 +21,104 @@ pub(crate) const IMAGE_FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8U
 #[derive(Debug)]
 pub(crate) struct RayCaster {
     pub(crate) layout: wgpu::BindGroupLayout,
-    pipelines: Mutex<HashMap<Variant, wgpu::ComputePipeline>>,
+    compiled: Arc<Mutex<Compiled>>,
+    /// Whether others than the drawing thread compile.
+    in_background: AtomicBool,
+}
+
+#[derive(Debug, Default)]
+struct Compiled {
+    ready: HashMap<Variant, wgpu::ComputePipeline>,
+    /// Those that some thread compiles, or has.
+    begun: HashSet<Variant>,
+}
+
+impl Compiled {
+    /// One that draws the same, as cheaply as there is one.
+    fn stand_in(&self, wanted: Variant) -> Option<&wgpu::ComputePipeline> {
+        let able = self.ready.iter().filter(|(v, _)| v.stands_in_for(wanted));
+        let cheapest = able.min_by_key(|(variant, _)| (variant.slots, variant.bounded));
+        cheapest.map(|(_, pipeline)| pipeline)
+    }
+}
+
+fn lock(compiled: &Mutex<Compiled>) -> MutexGuard<'_, Compiled> {
+    compiled.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl RayCaster {
-    pub(crate) fn new(device: &wgpu::Device) -> Self {
+    /// With `in_background`, other threads compile what can wait, where there are threads.
+    pub(crate) fn new(device: &wgpu::Device, in_background: bool) -> Self {
         Self {
             layout: bind_group_layout(device),
-            pipelines: Mutex::default(),
+            compiled: Arc::default(),
+            in_background: AtomicBool::new(in_background && platform::HAS_THREADS),
         }
     }
 
-    /// The pipeline of a variant, compiled when it is first asked for.
+    /// A pipeline that draws as this variant does: the variant's own, another one until that is compiled, or else its own,
+    /// compiled at once.
     pub(crate) fn pipeline(
         &self,
         device: &wgpu::Device,
         variant: Variant,
     ) -> wgpu::ComputePipeline {
-        let mut pipelines = self
-            .pipelines
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        let compile = || pipeline(device, &self.layout, variant);
-        pipelines.entry(variant).or_insert_with(compile).clone()
+        let compiled = lock(&self.compiled);
+        if let Some(pipeline) = compiled.ready.get(&variant) {
+            return pipeline.clone();
+        }
+        if self.in_background.load(Ordering::Relaxed)
+            && let Some(stand_in) = compiled.stand_in(variant).cloned()
+        {
+            drop(compiled);
+            self.prepare(device, &[variant]);
+            return stand_in;
+        }
+        drop(compiled);
+        let pipeline = pipeline(device, &self.layout, variant);
+        let mut compiled = lock(&self.compiled);
+        compiled.ready.insert(variant, pipeline.clone());
+        pipeline
+    }
+
+    /// Compiles in the background what may be asked for soon.
+    pub(crate) fn prepare(&self, device: &wgpu::Device, variants: &[Variant]) {
+        if !self.in_background.load(Ordering::Relaxed) {
+            return;
+        }
+        let mut compiled = lock(&self.compiled);
+        let Compiled { ready, begun } = &mut *compiled;
+        let new = variants.iter().copied();
+        let new = new.filter(|variant| !ready.contains_key(variant) && begun.insert(*variant));
+        let new: Vec<_> = new.collect();
+        drop(compiled);
+        if new.is_empty() {
+            return;
+        }
+        let (device, layout) = (device.clone(), self.layout.clone());
+        let (compiled, variants) = (Arc::clone(&self.compiled), new.clone());
+        let started = platform::spawn(move || {
+            for variant in variants {
+                let pipeline = pipeline(&device, &layout, variant);
+                lock(&compiled).ready.insert(variant, pipeline);
+            }
+        });
+        if !started {
+            let mut compiled = lock(&self.compiled);
+            compiled.begun.retain(|variant| !new.contains(variant));
+        }
+    }
+
+    /// Has other threads compile whatever the device is.
+    #[cfg(test)]
+    pub(crate) fn compile_in_background(&self) {
+        self.in_background.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether a variant is compiled.
+    #[cfg(test)]
+    pub(crate) fn is_ready(&self, variant: Variant) -> bool {
+        lock(&self.compiled).ready.contains_key(&variant)
     }
 }
 

@@ -344,6 +344,8 @@ impl Renderer {
         let target = readback.as_ref().map(|r| r.staging.buffer());
         let bands = self.options.bands;
         resources.draw(gpu, &self.picture, (variant, &uniform), bands, target);
+        let next = variant.likely_next(self.volume.channels.len());
+        gpu.ray_caster().prepare(gpu.device(), &next);
         if let Some(readback) = readback {
             readback.staging.begin();
             readback.frame = frame;

@@ -150,3 +150,54 @@ fn a_burst_of_bricks_is_spread_over_frames() {
     assert_eq!(octree.noted().len(), resident.len());
     assert!(octree.residency_is_complete());
 }
+
+/// While a variant is compiled another draws, and nobody can tell.
+#[test]
+fn a_stand_in_draws_the_same_picture() {
+    let Some(gpu) = test_gpu() else { return };
+    let (mut renderer, view) = crowded(&gpu, 3);
+    let voxels: Vec<u8> = (0..BRICK_STORED_VOXELS)
+        .map(|i| u8::try_from(i / 34 % 34 * 7 + i % 5).unwrap())
+        .collect();
+    let settle = |renderer: &mut Renderer| {
+        for _ in 0..20 {
+            for id in frame(renderer, &view).misses {
+                let voxels = BrickVoxels::Voxels(&voxels);
+                renderer.deliver(id, voxels).unwrap();
+            }
+        }
+        pollster::block_on(renderer.read_pixels()).unwrap()
+    };
+    let wanted = |channels| {
+        let mode = mode_of(Mode::EmissionAbsorption);
+        Variant::new(channels, mode, false, crate::layout::FALSE_NONE, false)
+    };
+    // Three channels are compiled for at once: nothing could stand in.
+    renderer
+        .set_channels(&views(0..3, Polarity::Bright))
+        .unwrap();
+    let three = settle(&mut renderer);
+    assert!(gpu.ray_caster().is_ready(wanted(3)) && !gpu.ray_caster().is_ready(wanted(1)));
+    gpu.ray_caster().compile_in_background();
+    renderer
+        .set_channels(&views(0..1, Polarity::Bright))
+        .unwrap();
+    renderer.render(&view);
+    let stood_in = !gpu.ray_caster().is_ready(wanted(1));
+    pollster::block_on(renderer.finish());
+    let first = pollster::block_on(renderer.read_pixels()).unwrap();
+    let began = std::time::Instant::now();
+    let next = wanted(1).likely_next(3);
+    let ready = |variant: &Variant| gpu.ray_caster().is_ready(*variant);
+    while !(ready(&wanted(1)) && next.iter().all(ready)) {
+        assert!(began.elapsed().as_secs() < 300, "it is never compiled");
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    let own = settle(&mut renderer);
+    assert!(stood_in, "it was there before the frame was");
+    let differences = first.rgba.iter().zip(&own.rgba);
+    let most = differences.map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(most <= Some(1), "{most:?} apart");
+    assert!(own.rgba.chunks(4).any(|p| p[0] > 30), "something is seen");
+    assert!(three != own, "the comparison notices channels");
+}
