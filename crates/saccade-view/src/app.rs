@@ -251,7 +251,7 @@ impl App {
         let view = View {
             lod_bias: self.settings.lod_bias,
             substitute: self.settings.substitute,
-            false_colors: self.settings.false_colors.into(),
+            false_colors: self.settings.false_colors,
             background: self.settings.background,
             mode: self.settings.shown.drawn_mode(),
             clip: self.settings.shown.clip(self.session.volume()),

@@ -131,6 +131,10 @@ fn truth(facts: &Facts<'_>) -> Piece {
     let mut truth = match facts.fidelity() {
         Fidelity::Complete => piece(Tone::Good, "complete".to_owned()),
         Fidelity::Lost => piece(Tone::Bad, "the GPU is gone".to_owned()),
+        // Not for want of bricks.
+        Fidelity::Failed if status.fidelity.missing == 0 && progress.failure.is_some() => {
+            piece(Tone::Bad, "this cannot be drawn".to_owned())
+        }
         Fidelity::Failed => piece(Tone::Bad, format!("{} cannot be shown", missing())),
         Fidelity::Loading if progress.failure.is_some() => {
             piece(Tone::Bad, format!("{} missing, trying again", missing()))
@@ -157,10 +161,7 @@ fn of_acquisition(acquisition: &Acquisition) -> Vec<Piece> {
         let files = &acquisition.quarantined;
         // Not all are listed.
         let all = acquisition.set_aside.max(files.len() as u64);
-        let mut bad = piece(
-            Tone::Bad,
-            format!("{} set aside", count(all, "file")),
-        );
+        let mut bad = piece(Tone::Bad, format!("{} set aside", count(all, "file")));
         let mut named: Vec<String> = files
             .iter()
             .take(MAX_NAMED)
@@ -254,9 +255,9 @@ impl<'a> PageStatus<'a> {
             requests: status.progress.in_flight,
             failure: status.progress.failure.as_deref(),
             tiles: facts.acquisition.and_then(|a| a.tiles),
-            quarantined: facts.acquisition.map_or(0, |a| {
-                a.set_aside.max(a.quarantined.len() as u64)
-            }),
+            quarantined: facts
+                .acquisition
+                .map_or(0, |a| a.set_aside.max(a.quarantined.len() as u64)),
         }
     }
 }
@@ -376,6 +377,23 @@ mod tests {
                 (Tone::Bad, Some("unplugged"))
             );
         }
+    }
+
+    #[test]
+    fn what_is_not_drawn_at_all_says_why() {
+        let mut status = Status {
+            complete: false,
+            ..complete()
+        };
+        status.progress.failure = Some("too large".to_owned());
+        let facts = Facts {
+            status: &status,
+            preview: false,
+            acquisition: None,
+        };
+        let first = line(&facts).swap_remove(0);
+        assert_eq!(first.text, "this cannot be drawn");
+        assert_eq!(first.more.as_deref(), Some("too large"));
     }
 
     #[test]

@@ -6,7 +6,7 @@ use glam::UVec2;
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{TransferFunction, linear_from_srgb};
 use saccade_core::volume::Volume;
-use saccade_render::{ChannelError, Gpu, RendererError, View};
+use saccade_render::{ChannelError, FalseColors, Gpu, RendererError, View};
 use saccade_source::VolumeSource;
 use saccade_stream::policy::Limits;
 use saccade_stream::{Detail, Session, SessionError, SessionOptions, Wake};
@@ -33,8 +33,8 @@ pub struct ViewOptions {
     pub background: [f32; 3],
     /// Levels coarser (above 0) or finer than one voxel a pixel.
     pub lod_bias: f32,
-    /// Whether what is drawn from other levels is tinted.
-    pub false_colors: bool,
+    /// What colours tell besides values.
+    pub false_colors: FalseColors,
     /// Whether there is anything but the picture.
     pub ui: bool,
     /// Ceiling for GPU memory \[bytes\].
@@ -54,7 +54,7 @@ impl Default for ViewOptions {
             shown: Shown::default(),
             background: [0.0; 3],
             lod_bias: 0.0,
-            false_colors: false,
+            false_colors: FalseColors::None,
             ui: true,
             gpu_bytes: 512 << 20,
             limits: Limits::default(),
@@ -141,7 +141,7 @@ impl ViewOptions {
             clip: self.shown.clip(volume),
             heat: self.shown.heat,
             lod_bias: self.lod_bias,
-            false_colors: self.false_colors.into(),
+            false_colors: self.false_colors,
             ..View::new(camera, size)
         }
     }

@@ -175,7 +175,7 @@ mod tests {
             ("transfer", &format!("2:{json}")),
             ("transfer", "0:auto"),
             ("iso", "0.5,2:0.25"),
-            ("false-colors", "residency"),
+            ("false-colors", "level"),
             ("gpu-memory", "64"),
             ("host-memory", "128"),
             ("background", "#ffffff"),
@@ -199,7 +199,7 @@ mod tests {
             (Some(0), None),
         ];
         assert_eq!(view.transfers, transfers);
-        assert!(view.false_colors);
+        assert_eq!(view.false_colors, saccade_render::FalseColors::Level);
         assert_eq!(view.isos, [(None, 0.5), (Some(2), 0.25)]);
         assert_eq!(
             (view.gpu_bytes, view.limits.host_bytes),

@@ -5,7 +5,7 @@ mod channel;
 use egui::{Color32, RichText, Slider, Ui};
 use saccade_core::camera::Camera;
 use saccade_core::volume::Volume;
-use saccade_render::{Heat, Mode, Work};
+use saccade_render::{FalseColors, Heat, Mode, Work};
 use saccade_stream::Session;
 
 use crate::facts::{Piece, Tone};
@@ -18,7 +18,7 @@ use crate::transfer_editor::{self, TransferEditor};
 pub(crate) struct Settings {
     pub(crate) lod_bias: f32,
     pub(crate) substitute: bool,
-    pub(crate) false_colors: bool,
+    pub(crate) false_colors: FalseColors,
     /// Linear RGB.
     pub(crate) background: [f32; 3],
     /// Which part of the volume, and how.
@@ -98,7 +98,7 @@ pub(crate) fn show(
             let volume = session.volume().clone();
             shown(ui, session, settings, &volume, about.camera);
             ui.separator();
-            picture(ui, settings);
+            picture(ui, settings, &volume);
             ui.separator();
             let home = ui
                 .button("Whole volume")
@@ -220,6 +220,8 @@ fn shown(
             let Some(plane) = cut else { continue };
             let keeps = ui
                 .horizontal(|ui| {
+                    // With two buttons beside it.
+                    ui.spacing_mut().slider_width = 80.0;
                     along_normal(ui, plane, volume, "nm");
                     let flip = ui.button("Flip");
                     if flip.on_hover_text("Cut away the other side").clicked() {
@@ -345,18 +347,52 @@ fn work_name(work: Work) -> &'static str {
     }
 }
 
-fn picture(ui: &mut Ui, settings: &mut Settings) {
+fn picture(ui: &mut Ui, settings: &mut Settings, volume: &Volume) {
     ui.add(Slider::new(&mut settings.lod_bias, -2.0..=4.0).text("Coarser by levels"))
         .on_hover_text("0 is one voxel a pixel; higher is faster and needs less data");
     ui.checkbox(
         &mut settings.substitute,
         "Other levels stand in for missing bricks",
     );
-    ui.checkbox(&mut settings.false_colors, "Tint what is not at its level");
+    false_colors(ui, &mut settings.false_colors, volume);
     ui.horizontal(|ui| {
         ui.color_edit_button_rgb(&mut settings.background);
         ui.label("Background");
     });
+}
+
+/// What colours tell besides values.
+fn false_colors(ui: &mut Ui, colors: &mut FalseColors, volume: &Volume) {
+    let choices = [
+        (FalseColors::None, "none", "The transfer function's alone"),
+        (
+            FalseColors::Residency,
+            "residency",
+            "From green to red what is coarser than it should be, blue what is finer, magenta what is missing",
+        ),
+        (
+            FalseColors::Level,
+            "level",
+            "The level that each part is drawn from",
+        ),
+    ];
+    ui.horizontal(|ui| {
+        ui.label("Tint");
+        for (choice, name, what) in choices {
+            ui.selectable_value(colors, choice, name)
+                .on_hover_text(what);
+        }
+    });
+    if *colors == FalseColors::Level {
+        ui.horizontal_wrapped(|ui| {
+            ui.spacing_mut().item_spacing.x = 2.0;
+            for (level, _) in (0..).zip(&volume.levels) {
+                let [r, g, b] = FalseColors::of_level(level);
+                let text = RichText::new(format!(" {level} ")).color(Color32::BLACK);
+                ui.label(text.background_color(egui::Rgba::from_rgb(r, g, b)));
+            }
+        });
+    }
 }
 
 /// The fidelity line.

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use saccade_core::space::Point;
 use saccade_core::volume::Volume;
-use saccade_render::{Clip, Heat, Mode, Work};
+use saccade_render::{Clip, FalseColors, Heat, Mode, Work};
 
 use crate::plane::{AXES, Plane};
 
@@ -32,6 +32,13 @@ const MODES: [(&str, Mode); 3] = [
     ("light", Mode::EmissionAbsorption),
     ("maximum", Mode::Maximum),
     ("surface", Mode::IsoSurface),
+];
+
+/// Names of false colours, as addresses have them.
+const FALSE_COLORS: [(&str, FalseColors); 3] = [
+    ("none", FalseColors::None),
+    ("residency", FalseColors::Residency),
+    ("level", FalseColors::Level),
 ];
 
 /// Names of what rays do, as addresses have them, and what is much of it for a ray.
@@ -72,16 +79,15 @@ pub fn mode_from_text(text: &str) -> Result<Mode, ShownError> {
     }
 }
 
-/// Whether what is not drawn from its own level is tinted: `none` or `residency`.
+/// What colours tell besides values: `none`, `residency` or `level`.
 ///
 /// # Errors
 ///
 /// [`ShownError`] on anything else.
-pub fn false_colors_from_text(text: &str) -> Result<bool, ShownError> {
-    match text {
-        "none" => Ok(false),
-        "residency" => Ok(true),
-        _ => ShownError::of(text, "false colours", "none or residency"),
+pub fn false_colors_from_text(text: &str) -> Result<FalseColors, ShownError> {
+    match FALSE_COLORS.iter().find(|(name, _)| *name == text) {
+        Some((_, colors)) => Ok(*colors),
+        None => ShownError::of(text, "choice of false colours", "none, residency or level"),
     }
 }
 
@@ -342,9 +348,10 @@ mod tests {
         ] {
             assert!(box_from_text(bad).is_err(), "{bad:?}");
         }
-        assert_eq!(false_colors_from_text("none"), Ok(false));
-        assert_eq!(false_colors_from_text("residency"), Ok(true));
-        for bad in ["", "on", "Residency"] {
+        for (name, colors) in FALSE_COLORS {
+            assert_eq!(false_colors_from_text(name), Ok(colors));
+        }
+        for bad in ["", "on", "Level", "levels"] {
             assert!(false_colors_from_text(bad).is_err(), "{bad:?}");
         }
         let heat = |of, full| Ok(Heat { of, full });

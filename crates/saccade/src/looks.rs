@@ -1,11 +1,11 @@
 //! How a volume is shown: arguments that a window and a picture without one have in common.
 
 use anyhow::{Context, Result, ensure};
-use clap::{ArgAction, Args};
+use clap::Args;
 use glam::DVec3;
 use saccade_core::camera::Camera;
 use saccade_core::transfer::TransferFunction;
-use saccade_render::{Heat, Mode};
+use saccade_render::{FalseColors, Heat, Mode};
 use saccade_stream::Detail;
 use saccade_stream::policy::Limits;
 use saccade_view::{
@@ -85,9 +85,10 @@ pub(crate) struct Looks {
     #[arg(long, value_name = "WORK[=FULL]", value_parser = heat_from_text)]
     heat: Option<Heat>,
 
-    /// Tint what is not drawn from its own level, and show what is missing: none or residency
-    #[arg(long, value_name = "WHICH", value_parser = false_colors_from_text, default_value = "none", action = ArgAction::Set)]
-    false_colors: bool,
+    /// Tint what is not drawn from the level that it should be, and show what is missing (residency), or tint each part
+    /// by the level that it is drawn from (level), or do not (none)
+    #[arg(long, value_name = "WHICH", value_parser = false_colors_from_text, default_value = "none")]
+    false_colors: FalseColors,
 
     /// How finely channels are drawn: full, content (no level that differs by less than a hundredth from the next
     /// coarser one), levels coarser than the view asks for, as in 2, or the levels that are drawn, 0 the finest, as

@@ -78,6 +78,14 @@ impl Render {
                 "one frame did not complete the picture, and it was not written; --timeout waits \
                  longer, --partial takes it as it is"
             ),
+            Err(SettleError::TooLarge { source }) => bail!(
+                "a picture of {}x{} pixels does not fit {} MiB of GPU memory beside the bricks that it \
+                 takes; give {} or more with --gpu-memory, or draw a smaller one with --size",
+                source.size.x,
+                source.size.y,
+                source.ceiling >> 20,
+                source.needed.div_ceil(1 << 20)
+            ),
             Err(error) => {
                 return Err(error).context(
                     "the picture is not complete and was not written; --timeout waits longer, \

@@ -454,7 +454,7 @@ fn no_gpu() {
 
 #[test]
 fn words_that_make_no_sense() {
-    let cases: [(&[&str], &[&str]); 23] = [
+    let cases: [(&[&str], &[&str]); 24] = [
         (
             &["simulate", "a", "--input", "b", "--extent", "9,9,9"],
             &["--extent", "cannot be used with", "--input"],
@@ -513,6 +513,10 @@ fn words_that_make_no_sense() {
         (
             &["view", "a", "--gpu-memory", "0"],
             &["whole MiB from 1 on"],
+        ),
+        (
+            &["view", "a", "--false-colors", "levels"],
+            &["levels", "none, residency or level"],
         ),
         (
             &["render", "a", "-o", "b", "--background", "red"],

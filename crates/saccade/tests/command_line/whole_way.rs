@@ -216,12 +216,23 @@ fn a_picture_that_is_coarser_because_memory_is_full_says_so() {
     assert_eq!(little.trim(), "complete, level 0");
     assert!(largest_difference(&fine, &same) <= ROUNDING);
 
-    let none = ["render", &image, "-o", "never.png", "--gpu-memory", "1"];
-    let output = run(none);
-    assert_eq!(output.status.code(), Some(1));
-    let said = stderr(&output);
-    for part in ["1 MiB of GPU memory are too few", "--gpu-memory "] {
-        assert!(said.contains(part), "{part:?} is not in: {said}");
+    let none = ["render", &image, "-o", "never.png", "--gpu-memory"];
+    for (more, parts) in [
+        (
+            &["1"][..],
+            ["1 MiB of GPU memory are too few", "--gpu-memory "],
+        ),
+        (
+            &["8", "--size", "4000x4000"],
+            ["4000x4000 pixels does not fit 8 MiB", "--gpu-memory"],
+        ),
+    ] {
+        let output = run(none.iter().chain(more));
+        assert_eq!(output.status.code(), Some(1));
+        let said = stderr(&output);
+        for part in parts {
+            assert!(said.contains(part), "{part:?} is not in: {said}");
+        }
     }
 }
 
@@ -305,9 +316,9 @@ fn each_channel_has_its_own_colours_and_surface() {
     assert_eq!(surface("0.95,1:0.4"), [false, true]);
 }
 
-/// What is not there yet has a colour of its own, and what is there has not.
+/// What is not there yet has a colour of its own, and what is there has not; or each level has one.
 #[test]
-fn false_colours_show_what_is_missing() {
+fn false_colours_show_what_is_missing_and_which_level_is_drawn() {
     let folder = tempfile::tempdir().unwrap();
     let archive = archive(folder.path());
     let picture = folder.path().join("picture.png");
@@ -321,6 +332,23 @@ fn false_colours_show_what_is_missing() {
     let plain = of(&[&early[..], &["none"]].concat()).unwrap();
     let tinted = of(&[&early[..], &["residency"]].concat()).unwrap();
     assert!(largest_difference(&plain, &tinted) > 40);
+
+    // Tissue is grey; level 0 is red and level 2 green.
+    let sums = |more: &[&str]| {
+        let mut sums = [0_u32; 3];
+        for pixel in of(more).unwrap().pixels() {
+            for (sum, value) in sums.iter_mut().zip(pixel.0) {
+                *sum += u32::from(value);
+            }
+        }
+        sums
+    };
+    let [r, g, b] = sums(&["--detail", "0-0"]);
+    assert!(r > 10_000 && r == g && g == b, "{r} {g} {b}");
+    let [r, g, b] = sums(&["--detail", "0-0", "--false-colors", "level"]);
+    assert!(r > g + g / 2 && r > b + b / 2, "{r} {g} {b}");
+    let [r, g, b] = sums(&["--detail", "2-2", "--false-colors", "level"]);
+    assert!(g > r + r / 4 && g > b + b / 4, "{r} {g} {b}");
 }
 
 #[test]
