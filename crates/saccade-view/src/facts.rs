@@ -132,8 +132,9 @@ fn truth(facts: &Facts<'_>) -> Piece {
         Fidelity::Complete => piece(Tone::Good, "complete".to_owned()),
         Fidelity::Lost => piece(Tone::Bad, "the GPU is gone".to_owned()),
         // Not for want of bricks.
-        Fidelity::Failed if status.fidelity.missing == 0 && progress.failure.is_some() => {
-            piece(Tone::Bad, "this cannot be drawn".to_owned())
+        Fidelity::Failed if status.fidelity.missing == 0 => {
+            let why = progress.failure.as_deref();
+            piece(Tone::Bad, why.unwrap_or("this cannot be drawn").to_owned())
         }
         Fidelity::Failed => piece(Tone::Bad, format!("{} cannot be shown", missing())),
         Fidelity::Loading if progress.failure.is_some() => {
@@ -392,8 +393,7 @@ mod tests {
             acquisition: None,
         };
         let first = line(&facts).swap_remove(0);
-        assert_eq!(first.text, "this cannot be drawn");
-        assert_eq!(first.more.as_deref(), Some("too large"));
+        assert_eq!((first.text.as_str(), first.tone), ("too large", Tone::Bad));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 mod channel;
 
-use egui::{Color32, RichText, Slider, Ui};
+use egui::{Color32, RichText, Slider, SliderClamping, Ui};
 use saccade_core::camera::Camera;
 use saccade_core::volume::Volume;
 use saccade_render::{FalseColors, Heat, Mode, Work};
@@ -292,7 +292,8 @@ fn slice(ui: &mut Ui, shown: &mut Shown, volume: &Volume, camera: &Camera) {
         None => along_normal(ui, plane, volume, "nm from the middle"),
     }
     let thickest = 2.0 * plane.reach(volume);
-    ui.add(Slider::new(&mut shown.slab_nm, 0.0..=thickest).text("nm thick"));
+    let slab = Slider::new(&mut shown.slab_nm, 0.0..=thickest).clamping(SliderClamping::Edits);
+    ui.add(slab.text("nm thick"));
 }
 
 /// Moves a plane along its normal.
@@ -334,6 +335,7 @@ fn heat(ui: &mut Ui, heat: &mut Option<Heat>) {
         ui.add(
             Slider::new(&mut heat.full, 1.0..=4096.0)
                 .logarithmic(true)
+                .clamping(SliderClamping::Edits)
                 .text("a ray is white"),
         );
     }
@@ -348,7 +350,9 @@ fn work_name(work: Work) -> &'static str {
 }
 
 fn picture(ui: &mut Ui, settings: &mut Settings, volume: &Volume) {
-    ui.add(Slider::new(&mut settings.lod_bias, -2.0..=4.0).text("Coarser by levels"))
+    // What was asked for beyond its ends stays until somebody moves it; so with the others.
+    let bias = Slider::new(&mut settings.lod_bias, -2.0..=4.0).clamping(SliderClamping::Edits);
+    ui.add(bias.text("Coarser by levels"))
         .on_hover_text("0 is one voxel a pixel; higher is faster and needs less data");
     ui.checkbox(
         &mut settings.substitute,
@@ -356,7 +360,11 @@ fn picture(ui: &mut Ui, settings: &mut Settings, volume: &Volume) {
     );
     false_colors(ui, &mut settings.false_colors, volume);
     ui.horizontal(|ui| {
-        ui.color_edit_button_rgb(&mut settings.background);
+        // The button rounds.
+        let mut background = settings.background;
+        if ui.color_edit_button_rgb(&mut background).changed() {
+            settings.background = background;
+        }
         ui.label("Background");
     });
 }
@@ -417,5 +425,44 @@ fn colour(ui: &Ui, tone: Tone) -> Color32 {
         Tone::Good => Color32::from_rgb(110, 200, 120),
         Tone::Busy => Color32::from_rgb(230, 180, 80),
         Tone::Bad => ui.visuals().error_fg_color,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_asked_for_stays_until_somebody_moves_it() {
+        let size = glam::DVec3::splat(4.0);
+        let volume = Volume::new("v", glam::UVec3::splat(100), size).unwrap();
+        let shown = Shown {
+            slice: Some(Plane::across(2, 50.0)),
+            slab_nm: 1e6,
+            heat: Some(Heat {
+                of: Work::Nodes,
+                full: 0.5,
+            }),
+            ..Shown::default()
+        };
+        let mut settings = Settings {
+            lod_bias: -3.0,
+            substitute: true,
+            false_colors: FalseColors::Level,
+            background: [0.0, 0.5, 1.0],
+            shown,
+            selected: 0,
+        };
+        let before = settings;
+        let camera = Camera::around(&volume);
+        let context = egui::Context::default();
+        for _ in 0..2 {
+            drop(context.run_ui(egui::RawInput::default(), |ui| {
+                slice(ui, &mut settings.shown, &volume, &camera);
+                heat(ui, &mut settings.shown.heat);
+                picture(ui, &mut settings, &volume);
+            }));
+        }
+        assert_eq!(settings, before);
     }
 }
