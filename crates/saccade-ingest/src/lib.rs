@@ -24,6 +24,7 @@ pub mod ingest;
 mod progress;
 pub mod replay;
 pub mod simulate;
+pub mod update;
 #[cfg(unix)]
 pub mod watch;
 

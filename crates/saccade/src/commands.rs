@@ -8,4 +8,5 @@ pub(crate) mod render;
 pub(crate) mod serve;
 pub(crate) mod simulate;
 mod subject;
+pub(crate) mod update;
 pub(crate) mod view;

@@ -136,6 +136,24 @@ impl BrokenRecord {
     }
 }
 
+impl Record {
+    /// The longest line that is a record \[bytes\].
+    pub const LONGEST: usize = prefix::MAX_LINE;
+
+    /// A line without its end, or what is wrong with it.
+    ///
+    /// # Errors
+    ///
+    /// The reason, in words.
+    pub fn parse(line: &[u8]) -> Result<Self, String> {
+        if line.len() >= Self::LONGEST {
+            let most = Self::LONGEST;
+            return Err(format!("it has {} bytes, more than {most}", line.len()));
+        }
+        parse(line)
+    }
+}
+
 /// A record, or what is wrong with it.
 fn parse(text: &[u8]) -> Result<Record, String> {
     match serde_json::from_slice(text) {

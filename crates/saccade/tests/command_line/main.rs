@@ -11,6 +11,7 @@ mod labels;
 mod postgres;
 mod server_away;
 mod store_away;
+mod update;
 mod whole_way;
 
 use std::ffi::OsStr;

@@ -1,0 +1,317 @@
+//! Transforms and deletions from others than the microscope: from registration, or by hand.
+//!
+//! They are told in the microscope's words, see [`Record`], but go straight to the catalog. So they also reach volumes
+//! whose records nobody may append to: those of a folder with a naming pattern or a list. What they say counts until the
+//! microscope says otherwise: a new image of a tile lies where its own record says, and brings a deleted tile back.
+//!
+//! # Transactions
+//!
+//! What is said of tiles of one section, line after line, becomes so at once. Small groups share a transaction; none has
+//! more than [`MOST`] lines, so that ingest is not kept waiting.
+
+use std::collections::HashSet;
+use std::io::{self, BufRead, Read as _};
+use std::time::SystemTime;
+
+use saccade_archive::acquisition::{DeleteRecord, Record, TransformRecord};
+use saccade_archive::catalog::{Catalog, CatalogError, DeleteOutcome, TransformOutcome};
+
+use crate::Cancel;
+
+/// Most lines of one transaction.
+pub const MOST: usize = 16_384;
+
+/// Lines of one transaction, where sections have fewer.
+const ENOUGH: usize = 256;
+
+/// Mistakes that are told.
+const TOLD: usize = 3;
+
+/// What a line says.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Change {
+    /// A tile lies elsewhere.
+    Transform(TransformRecord),
+    /// A tile is no more.
+    Delete(DeleteRecord),
+}
+
+impl Change {
+    /// The tile that it is about.
+    pub fn tile(&self) -> &str {
+        match self {
+            Self::Transform(record) => &record.tile,
+            Self::Delete(record) => &record.tile,
+        }
+    }
+}
+
+/// A line of a file of changes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Line {
+    /// Its number, from 1.
+    pub line: u64,
+    /// What it says.
+    pub change: Change,
+}
+
+/// Why changes could not be made, or not all of them.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum UpdateError {
+    /// The file cannot be read.
+    #[error(
+        "cannot read {name}; nothing was changed; check that it exists and that you may read it"
+    )]
+    Read {
+        /// What the system says.
+        source: io::Error,
+        /// The file.
+        name: String,
+    },
+    /// Some of its lines make no sense.
+    #[error(
+        "{name} cannot be used, and nothing was changed: {mistakes}; mend it and give it again"
+    )]
+    Lines {
+        /// The first wrong lines, and how many more there are.
+        mistakes: String,
+        /// The file.
+        name: String,
+    },
+    /// The catalog cannot be used.
+    #[error(
+        "{done} of {all} lines were gone through before; what they say is so, and the rest is as it was"
+    )]
+    Catalog {
+        /// Why.
+        source: CatalogError,
+        /// Lines before.
+        done: usize,
+        /// All lines.
+        all: usize,
+    },
+}
+
+/// Reads all changes; `name` is for messages.
+///
+/// # Errors
+///
+/// [`UpdateError::Read`], and [`UpdateError::Lines`] for lines that are no transforms or deletions.
+pub fn read(mut input: impl BufRead, name: &str) -> Result<Vec<Line>, UpdateError> {
+    let mut lines = Vec::new();
+    let (mut mistakes, mut more) = (Vec::new(), 0_u64);
+    let mut text = Vec::new();
+    for line in 1.. {
+        text.clear();
+        // A line without an end is not kept in memory whole.
+        let mut part = input.by_ref().take(Record::LONGEST as u64 + 1);
+        let read = part.read_until(b'\n', &mut text);
+        read.map_err(|source| UpdateError::Read {
+            source,
+            name: name.to_owned(),
+        })?;
+        if text.is_empty() {
+            break;
+        }
+        if text.len() > Record::LONGEST {
+            mistakes.push(format!("line {line} is no record, but longer than any"));
+            break;
+        }
+        if text.iter().all(u8::is_ascii_whitespace) {
+            continue;
+        }
+        let reason = match Record::parse(&text) {
+            Ok(Record::Transform(record)) => {
+                let change = Change::Transform(record);
+                lines.push(Line { line, change });
+                continue;
+            }
+            Ok(Record::Delete(record)) => {
+                let change = Change::Delete(record);
+                lines.push(Line { line, change });
+                continue;
+            }
+            Ok(Record::Tile(_)) => {
+                "it is about a new tile, which only `saccade ingest` takes in; what counts here is \
+                 \"transform\" and \"delete\""
+                    .to_owned()
+            }
+            Err(reason) => reason,
+        };
+        if mistakes.len() < TOLD {
+            mistakes.push(format!("line {line}: {reason}"));
+        } else {
+            more += 1;
+        }
+    }
+    if mistakes.is_empty() {
+        return Ok(lines);
+    }
+    let mut mistakes = mistakes.join("; ");
+    if more > 0 {
+        mistakes.push_str(&format!("; and {more} more lines"));
+    }
+    let name = name.to_owned();
+    Err(UpdateError::Lines { mistakes, name })
+}
+
+/// What became of changes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Summary {
+    /// Tiles that lie elsewhere now.
+    pub moved: u64,
+    /// Transforms that say what is so.
+    pub unchanged: u64,
+    /// Tiles that are no more.
+    pub deleted: u64,
+    /// Lines about tiles that the volume does not have.
+    pub unknown: u64,
+    /// Lines that cannot be: their tile would lie outside of the volume.
+    pub refused: u64,
+    /// Lines that were not gone through, because the work was cancelled.
+    pub left: u64,
+    /// The first of those that were not applied, in words.
+    pub not_applied: Vec<String>,
+}
+
+impl Summary {
+    /// Whether all lines were applied.
+    pub fn is_all(&self) -> bool {
+        self.unknown + self.refused + self.left == 0
+    }
+
+    fn note(&mut self, what: String) {
+        if self.not_applied.len() < TOLD {
+            self.not_applied.push(what);
+        }
+    }
+
+    fn add(&mut self, more: Self) {
+        self.moved += more.moved;
+        self.unchanged += more.unchanged;
+        self.deleted += more.deleted;
+        self.unknown += more.unknown;
+        self.refused += more.refused;
+        for what in more.not_applied {
+            self.note(what);
+        }
+    }
+}
+
+/// Makes changes of a volume. Cancelling ends it after the current transaction.
+///
+/// # Errors
+///
+/// [`UpdateError::Catalog`]; what was done before is so.
+pub async fn apply(
+    catalog: &Catalog,
+    volume: &str,
+    lines: &[Line],
+    cancel: &Cancel,
+) -> Result<Summary, UpdateError> {
+    let mut summary = Summary::default();
+    let mut done = 0;
+    let failed = |source, done| UpdateError::Catalog {
+        source,
+        done,
+        all: lines.len(),
+    };
+    // Deletions end what the records said so far, and nothing that they say later.
+    let read = catalog.cursor(volume).await.map_err(|e| failed(e, 0))?;
+    let position = read.offset.saturating_sub(1);
+    let mut group: Vec<(&Line, bool)> = Vec::new();
+    let mut gone = HashSet::new();
+    let mut section = None;
+    for line in lines {
+        if cancel.is_cancelled() {
+            break;
+        }
+        let name = line.change.tile();
+        let tile = catalog.tile(volume, name).await;
+        // A line before may be about to delete it.
+        let tile = tile.map_err(|e| failed(e, done))?;
+        let now = tile
+            .filter(|_| !gone.contains(name))
+            .map(|tile| tile.section);
+        if matches!(line.change, Change::Delete(_)) && now.is_some() {
+            gone.insert(name);
+        }
+        // Lines about nothing belong to whatever is around them.
+        let another = now.is_some() && section.is_some() && now != section;
+        if group.len() >= MOST || (another && group.len() >= ENOUGH) {
+            let applied = transaction(catalog, volume, &group, position).await;
+            summary.add(applied.map_err(|e| failed(e, done))?);
+            done += group.len();
+            group.clear();
+        }
+        section = now.or(section);
+        group.push((line, now.is_some()));
+    }
+    if !group.is_empty() && !cancel.is_cancelled() {
+        let applied = transaction(catalog, volume, &group, position).await;
+        summary.add(applied.map_err(|e| failed(e, done))?);
+        done += group.len();
+    }
+    summary.left = (lines.len() - done) as u64;
+    Ok(summary)
+}
+
+/// What became of a line.
+enum Outcome {
+    Moved,
+    Unchanged,
+    Deleted,
+    Unknown,
+    Refused(String),
+}
+
+async fn transaction(
+    catalog: &Catalog,
+    volume: &str,
+    lines: &[(&Line, bool)],
+    position: u64,
+) -> Result<Summary, CatalogError> {
+    let mut summary = Summary::default();
+    let mut commit = catalog.begin(volume).await?;
+    for (Line { line, change }, known) in lines {
+        let tile = change.tile();
+        let outcome = match change {
+            _ if !known => Outcome::Unknown,
+            Change::Transform(record) => {
+                match commit.transform(tile, record.transform, None).await {
+                    Ok(TransformOutcome::Moved) => Outcome::Moved,
+                    Ok(TransformOutcome::Unchanged) => Outcome::Unchanged,
+                    // Another process deleted it just now.
+                    Ok(TransformOutcome::Kept) => Outcome::Unknown,
+                    Err(outside @ CatalogError::OutsideVolume { .. }) => {
+                        Outcome::Refused(outside.to_string())
+                    }
+                    Err(e) => return Err(e),
+                }
+            }
+            Change::Delete(_) => match commit.delete(tile, position, SystemTime::now()).await? {
+                DeleteOutcome::Deleted => Outcome::Deleted,
+                DeleteOutcome::Unchanged | DeleteOutcome::Noted => Outcome::Unchanged,
+            },
+        };
+        match outcome {
+            Outcome::Moved => summary.moved += 1,
+            Outcome::Unchanged => summary.unchanged += 1,
+            Outcome::Deleted => summary.deleted += 1,
+            Outcome::Unknown => {
+                summary.unknown += 1;
+                summary.note(format!("line {line}: the volume has no tile {tile:?}"));
+            }
+            Outcome::Refused(why) => {
+                summary.refused += 1;
+                summary.note(format!("line {line}: {why}"));
+            }
+        }
+    }
+    commit.finish().await?;
+    Ok(summary)
+}
+
+#[cfg(test)]
+mod tests;

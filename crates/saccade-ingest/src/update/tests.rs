@@ -1,0 +1,231 @@
+use glam::{DVec2, DVec3, UVec2, UVec3};
+use saccade_archive::acquisition::Cursor;
+use saccade_archive::catalog::NewTile;
+use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::Volume;
+use tempfile::TempDir;
+
+use super::*;
+
+const VOLUME: &str = "cortex";
+
+/// A catalog whose tiles `s{section}_{n}` were told of in the first thousand bytes of records.
+async fn catalog(folder: &TempDir, sections: u32, each: u32) -> Catalog {
+    let catalog = Catalog::create(&folder.path().join("catalog.sqlite")).await;
+    let catalog = catalog.unwrap();
+    let volume = Volume::new(VOLUME, UVec3::new(500, 500, sections), DVec3::ONE).unwrap();
+    catalog.create_volume(&volume).await.unwrap();
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    for n in 0..sections * each {
+        let tile = tile(n / each, n % each, n.into());
+        commit.tile(&tile, SystemTime::now()).await.unwrap();
+    }
+    let cursor = Cursor {
+        offset: 1000,
+        line: 9,
+        seen: None,
+    };
+    commit.cursor(cursor).await.unwrap();
+    commit.finish().await.unwrap();
+    catalog
+}
+
+fn tile(section: u32, n: u32, position: u64) -> NewTile {
+    NewTile {
+        name: format!("s{section}_{n}"),
+        section,
+        channel: 0,
+        size: UVec2::splat(64),
+        transform: SectionFromTile::translation(DVec2::new(f64::from(n), 0.0)),
+        pyramid: format!("{section}/{n}/{position}"),
+        position,
+    }
+}
+
+fn moved(tile: &str, x: f64) -> String {
+    format!(r#"{{"record": "transform", "tile": "{tile}", "transform": [1, 0, 0, 1, {x}, 2]}}"#)
+}
+
+fn deleted(tile: &str) -> String {
+    format!(r#"{{"record": "delete", "tile": "{tile}"}}"#)
+}
+
+fn lines(text: &[String]) -> Vec<Line> {
+    read(text.join("\n").as_bytes(), "a file").unwrap()
+}
+
+async fn apply_all(catalog: &Catalog, text: &[String]) -> Summary {
+    apply(catalog, VOLUME, &lines(text), &Cancel::new())
+        .await
+        .unwrap()
+}
+
+#[tokio::test]
+async fn what_is_said_becomes_so_and_what_cannot_be_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(&folder, 2, 3).await;
+    let changes = [
+        moved("s0_0", 30.0),
+        String::new(),
+        moved("s0_1", 40.5),
+        moved("typo", 3.0),
+        moved("s0_2", 9000.0),
+        deleted("s1_0"),
+        deleted("s1_9"),
+        moved("s1_0", 1.0),
+    ];
+    let summary = apply_all(&catalog, &changes).await;
+    assert!(!summary.is_all());
+    assert_eq!(
+        (
+            summary.moved,
+            summary.unchanged,
+            summary.deleted,
+            summary.unknown,
+            summary.refused
+        ),
+        (2, 0, 1, 3, 1)
+    );
+    // By their lines in the file.
+    let told = summary.not_applied.join("\n");
+    assert!(
+        told.contains("line 4: the volume has no tile \"typo\""),
+        "{told}"
+    );
+    assert!(
+        told.contains("line 5: ") && told.contains("outside"),
+        "{told}"
+    );
+    let place = |name: &'static str| {
+        let catalog = catalog.clone();
+        async move {
+            let tile = catalog.tile(VOLUME, name).await.unwrap();
+            tile.map(|tile| tile.transform.elements()[4])
+        }
+    };
+    assert_eq!(place("s0_0").await, Some(30.0));
+    assert_eq!(place("s0_1").await, Some(40.5));
+    assert_eq!(place("s0_2").await, Some(2.0));
+    assert_eq!(place("s1_0").await, None);
+
+    // Again, nothing changes.
+    let revision = catalog.revision(VOLUME).await.unwrap();
+    let again = apply_all(&catalog, &changes[..3]).await;
+    assert_eq!((again.moved, again.unchanged), (0, 2));
+    assert!(again.is_all());
+    assert_eq!(catalog.revision(VOLUME).await.unwrap(), revision);
+
+    // The microscope's next image of a tile lies where its own record says, also of a deleted one.
+    for (section, n) in [(0, 0), (1, 0)] {
+        let tile = tile(section, n, 1000);
+        let mut commit = catalog.begin(VOLUME).await.unwrap();
+        commit.tile(&tile, SystemTime::now()).await.unwrap();
+        commit.finish().await.unwrap();
+    }
+    assert_eq!(place("s0_0").await, Some(0.0));
+    assert_eq!(place("s1_0").await, Some(0.0));
+    // What it said before does not bring one back.
+    apply_all(&catalog, &[deleted("s1_1")]).await;
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit
+        .tile(&tile(1, 1, 900), SystemTime::now())
+        .await
+        .unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(place("s1_1").await, None);
+}
+
+#[test]
+fn wrong_lines_are_named_with_their_file() {
+    let refuse = |text: &str| match read(text.as_bytes(), "moves.jsonl") {
+        Err(UpdateError::Lines { mistakes, name }) => {
+            assert_eq!(name, "moves.jsonl");
+            mistakes
+        }
+        other => panic!("{text}: {other:?}"),
+    };
+    let good = moved("a", 1.0);
+    let tile = r#"{"record": "tile", "tile": "a", "file": "a.tif", "section": 0, "size": [1, 1], "transform": [1, 0, 0, 1, 0, 0]}"#;
+    for (wrong, says) in [
+        ("{", "line 3: "),
+        (r#"{"record": "move", "tile": "a"}"#, "move"),
+        (r#"{"record": "transform", "tile": "a"}"#, "transform"),
+        (
+            r#"{"record": "transform", "tile": "a", "transform": [0, 0, 0, 0, 0, 0]}"#,
+            "line 3: ",
+        ),
+        (tile, "`saccade ingest`"),
+    ] {
+        let mistakes = refuse(&format!("{good}\n\n{wrong}\n{good}"));
+        assert!(
+            mistakes.contains("line 3: ") && mistakes.contains(says),
+            "{mistakes}"
+        );
+    }
+    let many = refuse(&"x\n".repeat(10));
+    assert!(
+        many.contains("line 3") && many.ends_with("and 7 more lines"),
+        "{many}"
+    );
+    let long = refuse(&format!("{good}\n{}", " ".repeat(1 << 20)));
+    assert!(long.contains("line 2 is no record"), "{long}");
+    assert_eq!(read(&b""[..], "nothing").unwrap(), []);
+}
+
+/// Whoever looks sees all of a section's tiles where they were, or all where they are now.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_section_moves_at_once() {
+    const SECTIONS: u32 = 6;
+    const EACH: u32 = 200;
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(&folder, SECTIONS, EACH).await;
+    let before = catalog.revision(VOLUME).await.unwrap();
+    let names = (0..SECTIONS * EACH).map(|n| format!("s{}_{}", n / EACH, n % EACH));
+    let changes = lines(&names.map(|name| moved(&name, 300.0)).collect::<Vec<_>>());
+    let looking = {
+        let catalog = catalog.clone();
+        tokio::spawn(async move {
+            let mut between = 0;
+            loop {
+                let mut all = 0;
+                for section in 0..SECTIONS {
+                    let tiles = catalog.section_tiles(VOLUME, section).await.unwrap();
+                    let there = |tile: &&saccade_archive::catalog::Tile| {
+                        tile.transform.elements()[4] == 300.0
+                    };
+                    let moved = tiles.iter().filter(there).count();
+                    assert!(
+                        moved == 0 || moved == tiles.len(),
+                        "{moved} of {}",
+                        tiles.len()
+                    );
+                    all += usize::from(moved > 0);
+                }
+                between += u32::from(all > 0 && all < SECTIONS as usize);
+                if all == SECTIONS as usize {
+                    return between;
+                }
+            }
+        })
+    };
+    let summary = apply(&catalog, VOLUME, &changes, &Cancel::new())
+        .await
+        .unwrap();
+    assert_eq!(summary.moved, u64::from(SECTIONS * EACH));
+    looking.await.unwrap();
+    // Whoever has the volume open is told what to draw again.
+    let changed = catalog.changes_after(VOLUME, before).await.unwrap();
+    assert!(format!("{changed:?}").contains("Transform"), "{changed:?}");
+}
+
+#[tokio::test]
+async fn who_cancels_is_told_what_is_left() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(&folder, 1, 2).await;
+    let cancel = Cancel::new();
+    cancel.cancel();
+    let changes = lines(&[moved("s0_0", 30.0), moved("s0_1", 30.0)]);
+    let summary = apply(&catalog, VOLUME, &changes, &cancel).await.unwrap();
+    assert_eq!((summary.moved, summary.left), (0, 2));
+    assert!(!summary.is_all());
+}
