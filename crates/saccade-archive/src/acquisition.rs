@@ -62,8 +62,8 @@ pub enum AcquisitionError {
     /// The folder holds no `volume.json`.
     #[error(
         "this folder is no acquisition archive: it has no {}, which the microscope's software writes before the \
-         first tile. Images whose names say where they lie are taken in with --pattern; of a stack, or of tiles with \
-         a list of their places, `saccade simulate ACQUISITION --input FOLDER` makes an acquisition, and \
+         first tile. Images whose names say where they lie are taken in with --pattern, and those of which a list says \
+         it with --list; of a stack, `saccade simulate ACQUISITION --input FOLDER` makes an acquisition, and \
          `saccade demo --input FOLDER` shows it at once: {}",
         AcquisitionInfo::FILE, path.display()
     )]

@@ -33,12 +33,12 @@ use crate::simulate::write::part_of;
 use crate::simulate::{SimulateError, SimulateSummary};
 use crate::{Cancel, Meter, Progress, State};
 
-mod acquisition;
-mod detect;
-mod lists;
+pub(crate) mod acquisition;
+pub(crate) mod detect;
+pub(crate) mod lists;
 
 pub use acquisition::{Acquisition, RawTile};
-pub use detect::{Input, detect};
+pub use detect::{Input, detect, find_list};
 
 /// How an acquisition is replayed.
 #[derive(Clone, Debug, PartialEq)]

@@ -38,6 +38,7 @@ use stamps::Stamps;
 
 mod again;
 mod list;
+mod listed;
 mod pattern;
 mod scan;
 mod stamp;
@@ -45,6 +46,7 @@ mod stamps;
 #[cfg(test)]
 mod tests;
 
+pub use listed::{ListConfig, ListError, ListWatch, Until, follow, kept_list};
 pub use pattern::{Pattern, PatternError, Place};
 pub use scan::{Counts, Disk, Entry, Folders, Found, Next, Scanner};
 pub use stamp::Stamp;

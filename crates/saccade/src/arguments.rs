@@ -101,6 +101,16 @@ pub(crate) fn pitch(text: &str) -> Result<DVec2, String> {
         .ok_or_else(|| "tiles lie more than 0 and at most a million voxels apart".into())
 }
 
+/// A place, as `x,y`.
+pub(crate) fn corner(text: &str) -> Result<DVec2, String> {
+    let [x, y] = numbers(text, ',').ok_or("give two numbers of pixels as x,y")?;
+    let corner = DVec2::new(x, y);
+    let sensible = corner.is_finite() && corner.abs().max_element() <= 1e9;
+    sensible
+        .then_some(corner)
+        .ok_or_else(|| "tiles lie within a thousand million pixels of zero".into())
+}
+
 /// Voxels per pixel.
 pub(crate) fn scale(text: &str) -> Result<f64, String> {
     let scale: f64 = text.parse().map_err(|_| "give a number, such as 4")?;

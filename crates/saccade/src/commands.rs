@@ -3,6 +3,7 @@
 pub(crate) mod check;
 pub(crate) mod demo;
 pub(crate) mod export;
+mod followed;
 pub(crate) mod ingest;
 pub(crate) mod render;
 pub(crate) mod serve;

@@ -215,7 +215,7 @@ impl Context<'_> {
         }
         if place(self.extent, section, size, transform).is_none() {
             let check = if watched {
-                "its name, --first, --pitch and --extent"
+                "its name, --first, --pitch and --extent, or the list, --origin and --extent"
             } else {
                 "its section, transform and the extent in volume.json"
             };

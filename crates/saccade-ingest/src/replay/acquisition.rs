@@ -208,7 +208,7 @@ fn centre(transform: SectionFromTile, size: UVec2) -> DVec2 {
 }
 
 /// The median offset of solution from stage, per axis.
-pub(super) fn median_offset(tiles: &[RawTile]) -> Option<DVec2> {
+pub(crate) fn median_offset(tiles: &[RawTile]) -> Option<DVec2> {
     let offset =
         |tile: &RawTile| Some(centre(tile.aligned?, tile.size) - centre(tile.stage, tile.size));
     let offsets: Vec<DVec2> = tiles.iter().filter_map(offset).collect();
@@ -229,10 +229,10 @@ fn remove_median_offset(tiles: &mut [RawTile]) {
     }
 }
 
-/// Moves all tiles so that the low corner of everything is the origin; the extent that holds them.
-fn move_to_origin(tiles: &mut [RawTile], list: &Path) -> Result<UVec3, ReplayError> {
+/// The low corner of everything, on whole pixels, and how much there is from it on.
+pub(crate) fn spanned(tiles: &[RawTile], list: &Path) -> Result<(DVec2, DVec2), ReplayError> {
     let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-    for tile in &*tiles {
+    for tile in tiles {
         for transform in [Some(tile.stage), tile.aligned].into_iter().flatten() {
             let (min, max) = transform.bounds(tile.size.as_dvec2());
             (low, high) = (low.min(min.0), high.max(max.0));
@@ -249,6 +249,12 @@ fn move_to_origin(tiles: &mut [RawTile], list: &Path) -> Result<UVec3, ReplayErr
             list,
         });
     }
+    Ok((low, size))
+}
+
+/// Moves all tiles so that the low corner of everything is the origin; the extent that holds them.
+fn move_to_origin(tiles: &mut [RawTile], list: &Path) -> Result<UVec3, ReplayError> {
+    let (low, size) = spanned(tiles, list)?;
     for tile in &mut *tiles {
         tile.stage = tile.stage.shifted(-low);
         tile.aligned = tile.aligned.map(|aligned| aligned.shifted(-low));

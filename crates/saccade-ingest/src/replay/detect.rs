@@ -9,11 +9,11 @@ use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, trakem2};
 
 use super::acquisition::median_offset;
 use super::lists::{self, List, Solution};
-use super::{Acquisition, ReplayError};
+use super::{Acquisition, RawTile, ReplayError};
 use crate::simulate::stack::{self, Stack, volume_name};
 
 /// A text file larger than this is no tile list \[bytes\].
-const LARGEST_LIST: u64 = 256 << 20;
+pub(crate) const LARGEST_LIST: u64 = 256 << 20;
 
 /// Something to watch.
 pub enum Input {
@@ -153,8 +153,43 @@ impl Tree {
     }
 }
 
+/// The list of a folder's tiles, to be followed: the one that [`detect`] finds, also while images are missing, or else
+/// a TrakEM2 project of images that are there.
+///
+/// # Errors
+///
+/// [`ReplayError`]: a list that cannot be read.
+pub fn find_list(folder: &Path) -> Result<Option<PathBuf>, ReplayError> {
+    let (tree, images) = (Tree::below(folder)?, Images::below(folder)?);
+    if let Some((list, ..)) = chosen(&tree, &images)? {
+        return Ok(Some(list));
+    }
+    for path in projects(&tree) {
+        let patches = trakem2::read(path)?;
+        if patches
+            .iter()
+            .any(|patch| images.find(&patch.file).is_some())
+        {
+            return Ok(Some(path.to_owned()));
+        }
+    }
+    Ok(None)
+}
+
 fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, ReplayError> {
     let images = Images::below(folder)?;
+    match chosen(tree, &images)? {
+        Some((list, listed, true)) => with_solution(folder, tree, &images, &list, listed).map(Some),
+        // Says which images are missing.
+        Some((list, listed, false)) => {
+            Acquisition::new(folder, &images, &list, &listed.tiles, None).map(Some)
+        }
+        None => refuse_project_alone(tree, &images).map(|()| None),
+    }
+}
+
+/// The list that is meant, and whether all of its images are there.
+fn chosen(tree: &Tree, images: &Images) -> Result<Option<(PathBuf, List, bool)>, ReplayError> {
     let (mut incomplete, mut unreadable) = (None, None);
     let text = tree.with_extension("txt");
     for list in text.chain(tree.with_extension("json")).filter(small) {
@@ -163,7 +198,7 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
         }
         let listed = match lists::read(list) {
             Ok(listed) => listed,
-            Err(error) if lists::is_meant(list, &images) => {
+            Err(error) if lists::is_meant(list, images) => {
                 // Text is surely a list; of JSON, another file may be the one that is meant.
                 if list
                     .extension()
@@ -183,20 +218,16 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
             .filter(|tile| images.find(&tile.file).is_some());
         let found = here.count();
         if found > 0 && found == tiles.len() {
-            return Ok(Some(with_solution(folder, tree, &images, list, listed)?));
+            return Ok(Some((list.to_owned(), listed, true)));
         }
         let counts = found > 0 || lists::is_certain(list, tiles);
         if counts && incomplete.is_none() {
-            incomplete = Some((list.to_owned(), listed.tiles));
+            incomplete = Some((list.to_owned(), listed, false));
         }
     }
-    match (incomplete, unreadable) {
-        (_, Some(error)) => Err(error.into()),
-        // Says which images are missing.
-        (Some((list, listed)), None) => {
-            Acquisition::new(folder, &images, &list, &listed, None).map(Some)
-        }
-        (None, None) => refuse_project_alone(tree, &images).map(|()| None),
+    match unreadable {
+        Some(error) => Err(error.into()),
+        None => Ok(incomplete),
     }
 }
 
@@ -239,14 +270,26 @@ fn with_solution(
         // Names that mean several tiles cannot be looked up in a solution.
         return Ok(unsolved);
     }
-    let mut best: Option<Solution> = None;
     let mut solutions = Vec::from_iter(listed.solution);
     for project in projects(tree) {
         solutions.push(Solution::read(project)?);
     }
+    match best(&wanted, &unsolved.tiles, solutions) {
+        None => Ok(unsolved),
+        Some(best) => Acquisition::new(folder, images, list, &listed.tiles, Some(&best)),
+    }
+}
+
+/// The solution that counts for all these tiles, if there is one.
+pub(crate) fn best(
+    wanted: &BTreeSet<&str>,
+    tiles: &[RawTile],
+    solutions: Vec<Solution>,
+) -> Option<Solution> {
+    let mut best: Option<Solution> = None;
     for solution in solutions {
         let has = |name: &&str| solution.transforms.contains_key(*name);
-        if !wanted.iter().all(has) || !refines(&unsolved, &solution) {
+        if !wanted.iter().all(has) || !refines(tiles, &solution) {
             continue;
         }
         if best
@@ -256,18 +299,15 @@ fn with_solution(
             best = Some(solution);
         }
     }
-    match &best {
-        None => Ok(unsolved),
-        Some(best) => Acquisition::new(folder, images, list, &listed.tiles, Some(best)),
-    }
+    best
 }
 
 /// Whether a solution says anything that the stage did not.
-fn refines(acquisition: &Acquisition, solution: &Solution) -> bool {
+fn refines(tiles: &[RawTile], solution: &Solution) -> bool {
     if solution.is_affine() {
         return true;
     }
-    let mut tiles = acquisition.tiles.clone();
+    let mut tiles = tiles.to_vec();
     for tile in &mut tiles {
         tile.aligned = solution.transforms.get(&tile.name).copied();
     }

@@ -14,16 +14,16 @@ use saccade_core::transform::{SectionFromTile, TilePoint};
 
 /// Where registration says that tiles lie.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Solution {
+pub(crate) struct Solution {
     /// The file that says so.
-    pub(super) path: PathBuf,
+    pub(crate) path: PathBuf,
     /// By the tiles' names.
-    pub(super) transforms: BTreeMap<String, SectionFromTile>,
+    pub(crate) transforms: BTreeMap<String, SectionFromTile>,
 }
 
 impl Solution {
     /// Of a TrakEM2 project.
-    pub(super) fn read(path: &Path) -> Result<Self, AcquisitionError> {
+    pub(crate) fn read(path: &Path) -> Result<Self, AcquisitionError> {
         let patches = trakem2::read(path)?;
         let named = patches
             .iter()
@@ -42,9 +42,9 @@ impl Solution {
 }
 
 /// Tiles with the places that the stage had for them, and what the same program says of them.
-pub(super) struct List {
-    pub(super) tiles: Vec<ListedTile>,
-    pub(super) solution: Option<Solution>,
+pub(crate) struct List {
+    pub(crate) tiles: Vec<ListedTile>,
+    pub(crate) solution: Option<Solution>,
 }
 
 /// Whether a file is what Fiji made of the list beside it.
@@ -56,7 +56,7 @@ pub(super) fn is_registered(path: &Path) -> bool {
 
 /// Reads a list, whose kind its name and content tell. Most files are no lists; that is an error
 /// like any other.
-pub(super) fn read(path: &Path) -> Result<List, AcquisitionError> {
+pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
     if path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("json"))
@@ -154,7 +154,7 @@ pub(super) fn is_certain(path: &Path, tiles: &[ListedTile]) -> bool {
 }
 
 /// Whether a file is a project of TrakEM2 with images, readable or not.
-pub(super) fn is_project(path: &Path) -> bool {
+pub(crate) fn is_project(path: &Path) -> bool {
     let text = fs::read(path).unwrap_or_default();
     text.windows(8).any(|word| word == b"t2_patch")
 }

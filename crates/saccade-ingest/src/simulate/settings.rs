@@ -43,6 +43,33 @@ impl Settings {
         Self::new(json!({ "pattern": pattern, "pitch": pitch, "pixel": pixel, "first": first }))
     }
 
+    /// Of a folder whose tiles a list names, by the names of its options.
+    pub(crate) fn of_list(list: &str, origin: [f64; 2], first: u32, pixel: f64) -> Self {
+        Self::new(json!({ "list": list, "origin": origin, "first": first, "pixel": pixel }))
+    }
+
+    /// Of what registration found, and how far its frame is from the stage's.
+    pub(crate) fn of_solution(path: &str, offset: [f64; 2]) -> Self {
+        Self::new(json!({ "solution": path, "offset": offset }))
+    }
+
+    /// One that is text.
+    pub(crate) fn text(&self, name: &str) -> Option<&str> {
+        self.0.get(name)?.as_str()
+    }
+
+    /// One that is a whole number.
+    pub(crate) fn number(&self, name: &str) -> Option<u32> {
+        u32::try_from(self.0.get(name)?.as_u64()?).ok()
+    }
+
+    /// One that is two numbers.
+    pub(crate) fn pair(&self, name: &str) -> Option<[f64; 2]> {
+        let pair = self.0.get(name)?.as_array()?;
+        let [x, y] = &pair[..] else { return None };
+        Some([x.as_f64()?, y.as_f64()?])
+    }
+
     /// As it will be read again: text may lose a number's last bit.
     fn new(settings: Value) -> Self {
         let text = settings.to_string();

@@ -14,26 +14,35 @@ const PAUSE: Duration = Duration::from_secs(1);
 const MOST: usize = 100_000;
 
 /// The files, the one that is due next first.
-#[derive(Debug, Default)]
-pub(super) struct Again {
-    files: VecDeque<Fresh>,
+#[derive(Debug)]
+pub(super) struct Again<T = Found> {
+    files: VecDeque<Fresh<T>>,
     keys: HashSet<u64>,
 }
 
 /// A file that was found not long ago.
 #[derive(Debug)]
-pub(super) struct Fresh {
+pub(super) struct Fresh<T = Found> {
     pub(super) key: u64,
-    pub(super) found: Found,
+    pub(super) found: T,
     due: SystemTime,
     until: SystemTime,
     /// What it looks like while it changes.
     changing: Option<Seen>,
 }
 
-impl Again {
+impl<T> Default for Again<T> {
+    fn default() -> Self {
+        Self {
+            files: VecDeque::new(),
+            keys: HashSet::new(),
+        }
+    }
+}
+
+impl<T: Clone> Again<T> {
     /// Takes up a file that was found just now.
-    pub(super) fn add(&mut self, key: u64, found: &Found, now: SystemTime) {
+    pub(super) fn add(&mut self, key: u64, found: &T, now: SystemTime) {
         if self.files.len() < MOST && self.keys.insert(key) {
             self.files.push_back(Fresh {
                 key,
@@ -56,14 +65,14 @@ impl Again {
     }
 
     /// The next that is to be looked at, taken out.
-    pub(super) fn due(&mut self, now: SystemTime) -> Option<Fresh> {
+    pub(super) fn due(&mut self, now: SystemTime) -> Option<Fresh<T>> {
         // A clock that was set back makes none wait for it.
-        let due = |file: &mut Fresh| file.due <= now || file.due > now + PAUSE;
+        let due = |file: &mut Fresh<T>| file.due <= now || file.due > now + PAUSE;
         self.files.pop_front_if(due)
     }
 
     /// It was looked at; if it has rested for long enough, that was the last time.
-    pub(super) fn put_back(&mut self, mut file: Fresh, now: SystemTime) {
+    pub(super) fn put_back(&mut self, mut file: Fresh<T>, now: SystemTime) {
         if file.changing.is_none() && (now >= file.until || file.until > now + YOUNG) {
             self.keys.remove(&file.key);
         } else {
@@ -73,7 +82,7 @@ impl Again {
     }
 }
 
-impl Fresh {
+impl<T> Fresh<T> {
     /// Whether it is another than it was known as, and does not change any more.
     pub(super) fn is_whole_again(&mut self, known: Seen, seen: Seen, now: SystemTime) -> bool {
         if !known.is_replaced_by(seen) {

@@ -34,11 +34,15 @@ impl Stamp {
         })
     }
 
+    /// When it changed last.
+    pub(super) fn last(&self) -> SystemTime {
+        self.changed
+            .map_or(self.modified, |at| at.max(self.modified))
+    }
+
     /// Whether it changed so recently that somebody may still be at it. What is to come is as young.
     pub(super) fn is_young(&self, now: SystemTime) -> bool {
-        let last = self
-            .changed
-            .map_or(self.modified, |at| at.max(self.modified));
+        let last = self.last();
         now.duration_since(last).is_ok_and(|age| age < YOUNG) || last > now
     }
 }

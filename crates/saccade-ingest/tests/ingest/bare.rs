@@ -24,7 +24,7 @@ use crate::scope::{
 };
 
 const SIZE: UVec2 = UVec2::new(140, 130);
-const FOLDER: &str = "SACCADE_TEST_BARE_FOLDER";
+pub(crate) const FOLDER: &str = "SACCADE_TEST_BARE_FOLDER";
 
 fn config() -> WatchConfig {
     WatchConfig {
@@ -411,13 +411,13 @@ async fn child(folder: &Path) {
 }
 
 /// A child process, that must not end on its own.
-struct Worker {
+pub(crate) struct Worker {
     child: Child,
     lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
 }
 
 impl Worker {
-    fn start(test: &str, folder: &Path) -> Self {
+    pub(crate) fn start(test: &str, folder: &Path) -> Self {
         let mut command = Command::new(std::env::current_exe().unwrap());
         command
             .args(["--exact", test, "--nocapture"])
@@ -428,12 +428,12 @@ impl Worker {
         Self { child, lines }
     }
 
-    fn begins(&mut self) {
+    pub(crate) fn begins(&mut self) {
         let mut lines = self.lines.by_ref().map(Result::unwrap);
         assert!(lines.any(|line| line == "at work"), "it ended");
     }
 
-    fn kill(&mut self) {
+    pub(crate) fn kill(&mut self) {
         self.child.kill().unwrap();
         let status = self.child.wait().unwrap();
         assert_eq!(status.signal(), Some(9), "it ended on its own: {status}");

@@ -7,6 +7,7 @@ mod crashes;
 mod faults;
 mod kill;
 mod kinds;
+mod lists;
 mod mended;
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;

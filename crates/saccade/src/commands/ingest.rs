@@ -5,23 +5,26 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
-use glam::{DVec2, DVec3, UVec3};
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::catalog::Catalog;
 use saccade_archive::pyramid::Encoding;
-use saccade_archive::{CatalogLocation, VisualizationArchive};
-use saccade_core::volume::{Dtype, check_name};
+use saccade_archive::{ArchiveLocation, CatalogLocation, VisualizationArchive};
+use saccade_core::volume::check_name;
+use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
-use saccade_ingest::watch::{self, Disk, Pattern, Watch, WatchConfig};
+use saccade_ingest::watch::{self, Disk, ListWatch, Until, Watch};
+use tokio::task::JoinHandle;
 
-use crate::arguments::{Archive, extent, pitch, scale, volume_name, voxel_nm};
+use super::followed::{Bare, Followed};
+use crate::arguments::{Archive, volume_name};
 use crate::folders::overlap;
 use crate::interrupt::cancel_when_interrupted;
 use crate::open::waited_for;
 use crate::progress::Shown;
 use crate::report::say;
 
-/// Follow an acquisition archive and make each tile's pyramid and catalog entry as it arrives.
+/// Follow an acquisition archive, or a folder with a list of its tiles' places (Fiji, Render, TrakEM2, or `file x y
+/// z`), and make each tile's pyramid and catalog entry as it arrives.
 #[derive(Args)]
 pub(crate) struct Ingest {
     /// Folder that the microscope writes to
@@ -30,7 +33,8 @@ pub(crate) struct Ingest {
     #[command(flatten)]
     archive: Archive,
 
-    /// End once everything that is there is done, instead of following; with 3 if anything was set aside
+    /// End once everything that is there is done, instead of following; with 3 if anything was set aside, or images of a
+    /// list are missing
     #[arg(long)]
     once: bool,
 
@@ -47,81 +51,6 @@ pub(crate) struct Ingest {
     /// Tiles in work at the same time [default: 2]
     #[arg(long, value_name = "COUNT", value_parser = clap::value_parser!(u16).range(1..))]
     workers: Option<u16>,
-}
-
-/// A folder without records: file names say what lies where.
-#[derive(Args)]
-#[group(id = "bare")]
-pub(crate) struct Bare {
-    /// The folder holds no records: its file names are like this, such as
-    /// 's{section}/r{row}_c{column}_{channel}.tif'; {channel} and folders as needed, {} is anything
-    /// [default: tiles.jsonl names the files]
-    #[arg(long, value_name = "PATTERN", requires_all = ["extent", "voxel", "pitch"])]
-    pattern: Option<Pattern>,
-
-    /// Size of the volume [voxels], with --pattern [default: as volume.json says]
-    #[arg(long, value_name = "X,Y,Z", value_parser = extent, requires = "pattern")]
-    extent: Option<UVec3>,
-
-    /// Voxel size [nm], with --pattern [default: as volume.json says]
-    #[arg(long, value_name = "X,Y,Z", value_parser = voxel_nm, requires = "pattern")]
-    voxel: Option<DVec3>,
-
-    /// From a tile's corner to the next column's and the next row's [voxels], with --pattern [default: as
-    /// tiles.jsonl says]
-    #[arg(long, value_name = "X,Y", value_parser = pitch, requires = "pattern")]
-    pitch: Option<DVec2>,
-
-    /// Size of a pixel [voxels] [default: 1]
-    #[arg(long, value_name = "NUMBER", value_parser = scale, requires = "pattern")]
-    pixel: Option<f64>,
-
-    /// Number of the first section, row and column [default: 0]
-    #[arg(long, value_name = "NUMBER", requires = "pattern")]
-    first: Option<u32>,
-
-    /// Names of the channels, in order [default: one without a name]
-    #[arg(
-        long,
-        value_name = "NAME,...",
-        value_delimiter = ',',
-        requires = "pattern"
-    )]
-    channels: Vec<String>,
-
-    /// Bits of a voxel, 8 or 16 [default: 8]
-    #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u8).range(8..=16), requires = "pattern")]
-    bits: Option<u8>,
-}
-
-impl Bare {
-    /// What to watch, if the folder has no records; `name` is the volume's.
-    fn config(&self, name: &str) -> Result<Option<WatchConfig>> {
-        let (Some(pattern), Some(extent), Some(voxel_nm), Some(pitch)) =
-            (&self.pattern, self.extent, self.voxel, self.pitch)
-        else {
-            return Ok(None);
-        };
-        let mut info = AcquisitionInfo::new(name, extent, voxel_nm);
-        info.channels.clone_from(&self.channels);
-        info.dtype = match self.bits {
-            None | Some(8) => Dtype::Uint8,
-            Some(16) => Dtype::Uint16,
-            Some(bits) => anyhow::bail!("voxels have 8 or 16 bits, not {bits}"),
-        };
-        if let Some(mistake) = info.channel_mistake() {
-            anyhow::bail!("{mistake}; name each once with --channels");
-        }
-        Ok(Some(WatchConfig {
-            pattern: pattern.clone(),
-            info,
-            pitch,
-            scale: self.pixel.unwrap_or(1.0),
-            first: self.first.unwrap_or(0),
-            poll: IngestOptions::DEFAULT.poll,
-            budget: WatchConfig::BUDGET,
-        }))
-    }
 }
 
 /// How pyramids are stored.
@@ -217,18 +146,102 @@ async fn say_what_is_left(
     Ok(())
 }
 
+/// Where what is found in folders without records is kept.
+fn beside(location: &ArchiveLocation) -> Option<PathBuf> {
+    match (location.catalog(), location.folder()) {
+        (CatalogLocation::File(file), _) => Some(file.with_file_name("watched")),
+        (CatalogLocation::Postgres(_), folder) => folder.map(|folder| folder.join("watched")),
+    }
+}
+
+/// A folder without records that is followed.
+struct Begun {
+    /// Where its images are.
+    folder: PathBuf,
+    /// Whoever goes on following it.
+    watching: Option<JoinHandle<Result<u64>>>,
+    /// Which images are not there, in words, where nobody waits for them.
+    missing: Option<String>,
+}
+
 impl Ingest {
+    /// Follows a folder without records; `None` if that was cancelled before it was known what it shows.
+    async fn begin(
+        &self,
+        followed: Followed,
+        kept: &Path,
+        cancel: &Cancel,
+    ) -> Result<Option<Begun>> {
+        let shared = |leads: bool| {
+            if !leads {
+                say(
+                    "another process watches this folder; what it finds is shared, and should it end, this one goes on",
+                );
+            }
+        };
+        let (once, cancel) = (self.once, cancel.clone());
+        Ok(match followed {
+            Followed::Records => None,
+            Followed::Pattern(config) => {
+                let mut watch = Watch::open(config, Disk, &self.acquisition, kept)?;
+                shared(watch.leads());
+                let folder = watch.folder().to_owned();
+                let mut watching = None;
+                if once {
+                    watch::run(&mut watch, true, &cancel)?;
+                    if let Some(why) = watch.unmatched() {
+                        anyhow::bail!("{why}; give --pattern as the files are named");
+                    }
+                } else {
+                    let looks = move || Ok(watch::run(&mut watch, false, &cancel)?);
+                    watching = Some(tokio::task::spawn_blocking(looks));
+                }
+                Some(Begun {
+                    folder,
+                    watching,
+                    missing: None,
+                })
+            }
+            Followed::List(config) => {
+                let mut watch = ListWatch::open(config, Disk, &self.acquisition, kept)?;
+                shared(watch.leads());
+                let until = if once { Until::End } else { Until::Known };
+                let ends = cancel.clone();
+                let begin = move || {
+                    let begun = watch::follow(&mut watch, until, once, &ends);
+                    begun.map(|_| watch)
+                };
+                let mut watch = tokio::task::spawn_blocking(begin).await??;
+                if !watch.is_known() {
+                    return Ok(None);
+                }
+                let folder = watch.folder().to_owned();
+                let missing = watch.missing().filter(|_| once);
+                let watching = (!once).then(|| {
+                    let looks = move || Ok(watch::follow(&mut watch, Until::End, false, &cancel)?);
+                    tokio::task::spawn_blocking(looks)
+                });
+                Some(Begun {
+                    folder,
+                    watching,
+                    missing,
+                })
+            }
+        })
+    }
+
     pub(crate) async fn run(self) -> Result<ExitCode> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
         let name = self
             .volume
             .clone()
             .unwrap_or_else(|| named_after(&self.acquisition));
-        let bare = self.bare.config(&name)?;
-        if bare.is_none() {
-            AcquisitionInfo::read(&self.acquisition)?;
-        }
         let location = self.archive.location()?;
+        let beside = beside(&location);
+        let kept = beside.as_ref().map(|beside| beside.join(&name));
+        let followed = self
+            .bare
+            .followed(&self.acquisition, &name, kept.as_deref())?;
         if let Some(folder) = location.folder() {
             refuse_same_folder(&self.acquisition, folder)?;
         }
@@ -239,7 +252,7 @@ impl Ingest {
             () = cancel.cancelled() => return Ok(ExitCode::SUCCESS),
         };
         let mut options = IngestOptions {
-            volume: self.volume,
+            volume: self.volume.clone(),
             encoding: self.stored.encoding(),
             once: self.once,
             workers: self
@@ -249,34 +262,21 @@ impl Ingest {
         };
         let mut acquisition = self.acquisition.clone();
         let mut watching = None;
-        if let Some(config) = bare {
-            let beside = match (location.catalog(), location.folder()) {
-                (CatalogLocation::File(file), _) => file.with_file_name("watched"),
-                (CatalogLocation::Postgres(_), Some(folder)) => folder.join("watched"),
-                (CatalogLocation::Postgres(_), None) => anyhow::bail!(
-                    "what is found in a bare folder is kept beside the pyramids or the catalog, which \
+        let mut missing = None;
+        if !matches!(followed, Followed::Records) {
+            let Some(kept) = kept else {
+                anyhow::bail!(
+                    "what is found in a folder without records is kept beside the pyramids or the catalog, which \
                      are both elsewhere: name a file with --catalog, or a folder as archive"
-                ),
-            };
-            let kept = beside.join(&name);
-            let mut watch = Watch::open(config, Disk, &self.acquisition, &kept)?;
-            if !watch.leads() {
-                say(
-                    "another process watches this folder; what it finds is shared, and should it end, this one goes on",
                 );
-            }
-            acquisition = kept;
-            options.linked = Some(watch.folder().to_owned());
-            if self.once {
-                watch::run(&mut watch, true, &cancel)?;
-                if let Some(why) = watch.unmatched() {
-                    anyhow::bail!("{why}; give --pattern as the files are named");
-                }
-            } else {
-                let cancel = cancel.clone();
-                let looks = move || watch::run(&mut watch, false, &cancel);
-                watching = Some(tokio::task::spawn_blocking(looks));
-            }
+            };
+            acquisition.clone_from(&kept);
+            let begun = self.begin(followed, &kept, &cancel).await?;
+            let Some(begun) = begun.filter(|_| !cancel.is_cancelled()) else {
+                return Ok(ExitCode::SUCCESS);
+            };
+            options.linked = Some(begun.folder);
+            (watching, missing) = (begun.watching, begun.missing);
         }
         let shown = Shown::new("ingest", None);
         let taken_in = run(&acquisition, &archive, &options, &shown, &cancel);
@@ -322,7 +322,12 @@ impl Ingest {
             done.push_str(&format!(", {early} transforms of tiles that have not come"));
         }
         say(&format!("{done}: {location}"));
-        let all = !self.once || quarantined == 0;
+        if let Some(missing) = &missing {
+            say(&format!(
+                "{missing}; they are taken in when it is started again"
+            ));
+        }
+        let all = !self.once || (quarantined == 0 && missing.is_none());
         Ok(if all {
             ExitCode::SUCCESS
         } else {

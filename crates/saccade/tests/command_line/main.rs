@@ -6,6 +6,7 @@ mod demo;
 mod errors;
 mod images;
 mod labels;
+mod lists;
 #[allow(dead_code, reason = "others use more of it")]
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;

@@ -1,0 +1,409 @@
+//! Follows a folder of images with a list that says where each of them lies, and writes the records that its
+//! microscope does not.
+//!
+//! [`ListWatch`] keeps an acquisition archive of its own, as [`Watch`](super::Watch) does of a bare folder. The list is
+//! read again whenever its file has changed and rests: tiles that are new in it are told of once their image is there,
+//! those that lie elsewhere get a transform, those that are in it no more are deleted. Where registration has found
+//! better places, in Fiji's twin of the list, in Render's transforms or in a TrakEM2 project, these count.
+//!
+//! # Frame
+//!
+//! Lists count pixels from anywhere. Where the volume's corner and its first section lie, and how large it is, is
+//! settled when the list is first read, as replay settles it, and kept: what is listed later lies in the same frame.
+//!
+//! # Cost
+//!
+//! Half a kilobyte is kept per tile, and sixteen bytes per file of the folder. Files are asked for as those of a bare
+//! folder are: when their folder changed, and for half a minute after they came.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use glam::UVec2;
+use saccade_archive::acquisition::AcquisitionError;
+use saccade_core::transform::SectionFromTile;
+
+use super::again::Again;
+use super::list::List;
+use super::stamp::{Seen, Stamp};
+use super::stamps::Stamps;
+use super::{Folders, Next, Untold, WatchError};
+use frame::Frame;
+use index::{Index, base, key};
+use source::{Adopted, Files};
+
+mod config;
+mod follow;
+mod frame;
+mod index;
+mod reading;
+mod records;
+mod source;
+
+pub use config::{ListConfig, ListError};
+pub use follow::{Until, follow};
+pub use frame::kept_list;
+
+/// Whether a tile's image was found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Image {
+    Missing,
+    /// It is there, and to be told of.
+    Unread,
+    Told,
+}
+
+/// A tile as the list has it.
+#[derive(Debug)]
+struct Wanted {
+    file: String,
+    section: u32,
+    transform: SectionFromTile,
+    image: Image,
+}
+
+/// A tile as the records have it.
+#[derive(Debug)]
+struct Told {
+    /// Below the followed folder.
+    file: String,
+    section: u32,
+    size: UVec2,
+    transform: SectionFromTile,
+}
+
+#[derive(Debug, Default)]
+struct Tile {
+    wanted: Option<Wanted>,
+    told: Option<Told>,
+}
+
+/// A tile whose image is there.
+struct Unread {
+    tile: Arc<str>,
+    stamp: Option<Stamp>,
+    /// When it was seen to change last.
+    since: SystemTime,
+}
+
+/// What is wrong with the list as it was read last.
+#[derive(Clone)]
+enum Trouble {
+    Unreadable(Arc<AcquisitionError>),
+    Empty,
+}
+
+/// A folder with a list that is being followed.
+pub struct ListWatch<F> {
+    config: ListConfig,
+    disk: F,
+    folder: PathBuf,
+    kept: PathBuf,
+    index: Index,
+    files: Files,
+    trouble: Option<Trouble>,
+    frame: Option<Frame>,
+    adopted: Option<Adopted>,
+    /// The list of records, while this process is the one that writes it.
+    records: Option<List>,
+    tiles: BTreeMap<Arc<str>, Tile>,
+    /// Which tiles may have images of a name, by its hash.
+    by_name: HashMap<u64, Vec<Arc<str>>>,
+    /// Tiles whose image was not found.
+    missing: BTreeSet<Arc<str>>,
+    /// When one of them came last.
+    progress: SystemTime,
+    missing_told: bool,
+    unread: VecDeque<Unread>,
+    /// Records that could not be written yet.
+    untold: VecDeque<Untold>,
+    /// What files looked like when they were told of, by the hash of their path; `None` if that is not known.
+    seen: HashMap<u64, Option<Seen>>,
+    told_until: SystemTime,
+    stamps: Stamps,
+    again: Again<String>,
+    whole: bool,
+}
+
+impl<F: Folders> ListWatch<F> {
+    /// Begins, or goes on, to follow the list of the images below `folder`; the records are kept in `kept`.
+    ///
+    /// # Errors
+    ///
+    /// [`ListError`]: also if something else is kept there, or the same otherwise.
+    pub fn open(
+        config: ListConfig,
+        disk: F,
+        folder: &Path,
+        kept: &Path,
+    ) -> Result<Self, ListError> {
+        let look = |source| WatchError::Look {
+            source,
+            path: folder.to_owned(),
+        };
+        let folder = folder.canonicalize().map_err(look)?;
+        let list = std::path::absolute(&config.list).unwrap_or_else(|_| config.list.clone());
+        let config = ListConfig {
+            list: list.canonicalize().unwrap_or(list),
+            ..config
+        };
+        fs::create_dir_all(kept).map_err(|source| WatchError::Write {
+            source,
+            path: kept.to_owned(),
+        })?;
+        let stamps = Stamps::new(kept);
+        let frame = Frame::open(&config, &folder, kept)?;
+        if frame::link(&folder, kept)? {
+            // Copies are other files.
+            stamps.forget();
+        }
+        let now = disk.now();
+        let mut watch = Self {
+            index: Index::new(&folder),
+            files: Files::new(&config.list),
+            trouble: None,
+            adopted: frame.as_ref().and_then(|_| frame::adopted(&folder, kept)),
+            frame,
+            records: None,
+            tiles: BTreeMap::new(),
+            by_name: HashMap::new(),
+            missing: BTreeSet::new(),
+            progress: now,
+            missing_told: false,
+            unread: VecDeque::new(),
+            untold: VecDeque::new(),
+            seen: HashMap::new(),
+            told_until: SystemTime::UNIX_EPOCH,
+            stamps,
+            again: Again::default(),
+            whole: false,
+            kept: kept.to_owned(),
+            config,
+            disk,
+            folder,
+        };
+        watch.take_over()?;
+        Ok(watch)
+    }
+
+    /// The folder whose images are listed, see [`IngestOptions::linked`](crate::ingest::IngestOptions::linked).
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Where the records are kept: what [`crate::ingest::run`] follows, once the volume [`is_known`](Self::is_known).
+    pub fn acquisition(&self) -> &Path {
+        &self.kept
+    }
+
+    /// Whether this process writes the records. If not, another does, until it ends.
+    pub fn leads(&self) -> bool {
+        self.records.is_some()
+    }
+
+    /// Whether it is settled what the volume is.
+    pub fn is_known(&self) -> bool {
+        self.frame.is_some()
+    }
+
+    /// Which images are not there, in words, if any are not.
+    pub fn missing(&self) -> Option<String> {
+        let first = self.missing.first()?;
+        let file = &self.tiles.get(first)?.wanted.as_ref()?.file;
+        let (missing, all) = (self.missing.len(), self.tiles.len());
+        Some(format!(
+            "{missing} of the {all} images that the list names are not below {}, such as {file:?}",
+            self.folder.display()
+        ))
+    }
+
+    /// Takes over what was settled before, by whichever process.
+    fn open_frame(&mut self) -> Result<(), ListError> {
+        self.frame = Frame::open(&self.config, &self.folder, &self.kept)?;
+        if self.frame.is_some() {
+            self.adopted = frame::adopted(&self.folder, &self.kept);
+        }
+        Ok(())
+    }
+
+    /// One look; how many records were written, and what to do next. While another process writes the records,
+    /// there is nothing to do.
+    ///
+    /// # Errors
+    ///
+    /// [`ListError`]; what was found is not lost, and told by a later look.
+    pub fn look(&mut self) -> Result<(u64, Next), ListError> {
+        if !self.leads() {
+            if self.frame.is_none() {
+                self.open_frame()?;
+            }
+            if !self.take_over()? {
+                return Ok((0, Next::Rest));
+            }
+        }
+        // Nothing more is found before there is room for what was.
+        let before = self.tell()?;
+        let seen = self.index.look(&self.disk, self.config.budget);
+        let (met, mut next) = seen.map_err(|source| WatchError::Look {
+            source,
+            path: self.folder.clone(),
+        })?;
+        let now = self.disk.now();
+        for file in met {
+            self.met(&file, now);
+        }
+        if !self.index.is_whole() {
+            return Ok((before, next));
+        }
+        if !std::mem::replace(&mut self.whole, true) {
+            for tile in self.missing.clone() {
+                self.look_for(&tile, now);
+            }
+        }
+        let listed = self.read_list(now);
+        self.look_again(now);
+        self.read_images(now);
+        self.say_what_is_missing(now);
+        let told = before + self.tell()?;
+        let waits = listed? || !self.unread.is_empty() || self.again.waits();
+        if next == Next::Rest && waits {
+            next = Next::Again;
+        }
+        Ok((told, next))
+    }
+
+    /// A file of a folder that changed.
+    fn met(&mut self, file: &str, now: SystemTime) {
+        let Some(tiles) = self.by_name.get(&key(base(file))).cloned() else {
+            return;
+        };
+        let mut of_it = Vec::new();
+        for name in tiles {
+            let Some(Tile { wanted, told }) = self.tiles.get(&name) else {
+                continue;
+            };
+            match wanted.as_ref().map(|wanted| wanted.image) {
+                Some(Image::Missing) => self.look_for(&name, now),
+                Some(Image::Unread) => {}
+                // The list has it, or was not read yet.
+                Some(Image::Told) | None => {
+                    let is_it = told.as_ref().is_some_and(|told| told.file == file);
+                    of_it.extend(is_it.then_some(name));
+                }
+            }
+        }
+        if !of_it.is_empty() && self.is_replaced(file, now) {
+            for name in of_it {
+                self.tell_again(&name, now);
+            }
+        }
+    }
+
+    /// Whether a file that was told of is another now, or has another content; if it may still change, it is to be
+    /// looked at again.
+    fn is_replaced(&mut self, file: &str, now: SystemTime) -> bool {
+        let Ok(stamp) = self.disk.stamp(&self.folder.join(file)) else {
+            return false;
+        };
+        let (key, seen) = (key(file), Seen::of(&stamp));
+        if self.again.holds(key) {
+            return false;
+        }
+        let same = match self.seen.insert(key, Some(seen)) {
+            Some(Some(before)) => !before.is_replaced_by(seen),
+            Some(None) | None => stamp.modified <= self.told_until,
+        };
+        if stamp.is_young(now) || (!same && self.whole) {
+            self.again.add(key, &file.to_owned(), now);
+        }
+        !same
+    }
+
+    /// Looks for the image of a tile.
+    fn look_for(&mut self, tile: &Arc<str>, now: SystemTime) {
+        let Some(wanted) = self.tiles.get_mut(tile).and_then(|t| t.wanted.as_mut()) else {
+            return;
+        };
+        if self.whole && self.index.find(&wanted.file).is_some() {
+            self.missing.remove(tile);
+            (self.progress, self.missing_told) = (now, false);
+            wanted.image = Image::Unread;
+            self.unread.push_back(Unread {
+                tile: Arc::clone(tile),
+                stamp: None,
+                since: now,
+            });
+        } else {
+            wanted.image = Image::Missing;
+            self.missing.insert(Arc::clone(tile));
+        }
+    }
+
+    /// The image of a tile is another.
+    fn tell_again(&mut self, tile: &Arc<str>, now: SystemTime) {
+        let Some(Tile { wanted, told }) = self.tiles.get_mut(tile) else {
+            return;
+        };
+        match wanted {
+            Some(wanted) if wanted.image == Image::Told => {
+                wanted.image = Image::Unread;
+                self.unread.push_back(Unread {
+                    tile: Arc::clone(tile),
+                    stamp: None,
+                    since: now,
+                });
+            }
+            Some(_) => {}
+            // Found out again once the list is read.
+            None => {
+                if let Some(told) = told {
+                    told.size = UVec2::ZERO;
+                }
+            }
+        }
+    }
+
+    /// Looks at files again that somebody may still be writing to, with half of the questions at most.
+    fn look_again(&mut self, now: SystemTime) {
+        let mut most = self.config.budget.div_ceil(2);
+        while most > 0
+            && let Some(mut file) = self.again.due(now)
+        {
+            most -= 1;
+            let stamp = self.disk.stamp(&self.folder.join(&file.found)).ok();
+            let known = self.seen.get(&file.key).copied().flatten();
+            // One that is gone may be on its way to be another.
+            if let Some((stamp, known)) = stamp.zip(known)
+                && file.is_whole_again(known, Seen::of(&stamp), now)
+            {
+                self.seen.insert(file.key, Some(Seen::of(&stamp)));
+                let tiles = self.by_name.get(&key(base(&file.found))).cloned();
+                for tile in tiles.unwrap_or_default() {
+                    let told = self.tiles.get(&tile).and_then(|tile| tile.told.as_ref());
+                    if told.is_some_and(|told| told.file == file.found) {
+                        self.tell_again(&tile, now);
+                    }
+                }
+            }
+            self.again.put_back(file, now);
+        }
+    }
+
+    /// Once, when no image has come for a while.
+    fn say_what_is_missing(&mut self, now: SystemTime) {
+        const AFTER: Duration = Duration::from_secs(30);
+        let rests = now
+            .duration_since(self.progress)
+            .is_ok_and(|age| age > AFTER);
+        if rests
+            && !self.missing_told
+            && let Some(missing) = self.missing()
+        {
+            log::warn!("{missing}; they are waited for");
+            self.missing_told = true;
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! How a list is followed, and why it cannot be.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use glam::{DVec2, DVec3, UVec3};
+use saccade_archive::acquisition::AcquisitionError;
+use saccade_core::volume::Dtype;
+
+use super::super::WatchError;
+use super::source;
+use crate::replay::ReplayError;
+
+/// How a folder with a list is followed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ListConfig {
+    /// The list: `file x y z` per line, a tile configuration of Fiji, Render's tile specifications, or a TrakEM2
+    /// project.
+    pub list: PathBuf,
+    /// Name of the volume.
+    pub name: String,
+    /// Voxel size \[nm\].
+    pub voxel_nm: DVec3,
+    /// Size of the volume \[voxels\]; what the tiles span that are listed at first if `None`.
+    pub extent: Option<UVec3>,
+    /// Type of the voxels; as the images say that are there at first if `None`.
+    pub dtype: Option<Dtype>,
+    /// Where the list has the volume's corner \[pixels\]; the low corner of the tiles listed at first if `None`.
+    pub origin: Option<DVec2>,
+    /// Number of the first section; that of the tiles listed at first if `None`.
+    pub first: Option<u32>,
+    /// Size of a pixel \[voxels\].
+    pub scale: f64,
+    /// Pause between looks.
+    pub poll: Duration,
+    /// For how long the list must not have changed before it is read; four times as long before tiles are
+    /// deleted that it names no more.
+    pub rest: Duration,
+    /// Folders and files asked per look.
+    pub budget: usize,
+}
+
+impl ListConfig {
+    /// For how long a list rests, if nothing else is said.
+    pub const REST: Duration = Duration::from_secs(1);
+
+    /// Looks whether the list can be read; nothing is made yet.
+    ///
+    /// # Errors
+    ///
+    /// [`ListError::List`].
+    pub fn check(&self) -> Result<(), ListError> {
+        match source::read(&self.list) {
+            Ok(_) => Ok(()),
+            Err(e) => Err(ListError::List { source: e.into() }),
+        }
+    }
+}
+
+/// Why a list cannot be followed.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ListError {
+    /// The records cannot be kept, or the folder cannot be looked into.
+    #[error(transparent)]
+    Watch(#[from] WatchError),
+    /// The list makes no sense.
+    #[error("the list of tiles cannot be used; mend it, or name another with --list")]
+    List {
+        /// Why.
+        source: Arc<AcquisitionError>,
+    },
+    /// The list is not there.
+    #[error("the list of tiles is not there; put it back, or name another with --list: {}", path.display())]
+    Gone {
+        /// The list.
+        path: PathBuf,
+    },
+    /// The list names nothing.
+    #[error(
+        "the list of tiles names no tile: it may be about to be written; if nothing is to be shown any more, end \
+         ingest instead: {}",
+        path.display()
+    )]
+    Empty {
+        /// The list.
+        path: PathBuf,
+    },
+    /// No image can be read, from which the volume's size or bits could be told.
+    #[error(
+        "none of the {tiles} images that the list names, such as {first:?}, is there and can be read, so that size and \
+         bits of the volume are not known; copy them into {}, or say --extent, --origin and --bits: {}",
+        folder.display(), list.display()
+    )]
+    NoImages {
+        /// Tiles of the list.
+        tiles: usize,
+        /// The first, as the list names it.
+        first: String,
+        /// Where images are looked for.
+        folder: PathBuf,
+        /// The list.
+        list: PathBuf,
+    },
+    /// The tiles span too much.
+    #[error(transparent)]
+    Frame(#[from] ReplayError),
+}
+
+impl From<AcquisitionError> for ListError {
+    fn from(error: AcquisitionError) -> Self {
+        Self::Watch(error.into())
+    }
+}
+
+impl ListError {
+    /// Whether somebody may be about to mend it.
+    pub(super) fn may_pass(&self) -> bool {
+        match self {
+            Self::Watch(WatchError::Look { .. })
+            | Self::List { .. }
+            | Self::Gone { .. }
+            | Self::Empty { .. }
+            | Self::NoImages { .. } => true,
+            Self::Watch(_) | Self::Frame(_) => false,
+        }
+    }
+
+    pub(super) fn is_full(&self) -> bool {
+        matches!(self, Self::Watch(e) if e.is_full())
+    }
+}

@@ -1,0 +1,275 @@
+//! Which files lie below a folder, found with few questions to the file system.
+//!
+//! A look asks so many folders and entries, lists only folders that changed since they were last listed, and goes on
+//! where the last one stopped. Sixteen bytes are kept per file.
+
+use std::collections::{BTreeSet, HashMap};
+use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use saccade_archive::acquisition::image_path;
+
+use super::super::{Entry, Folders, Next};
+
+/// A folder's time counts only once it is this old: file systems stamp coarsely.
+const SETTLED: Duration = Duration::from_secs(3);
+
+struct Folder {
+    /// Below the root; empty for itself.
+    path: PathBuf,
+    /// Its time when it was last listed whole; `None` if it must be listed again.
+    listed: Option<SystemTime>,
+    /// Why it could not be looked into, when that was said.
+    closed: Option<io::ErrorKind>,
+}
+
+struct Listing {
+    folder: usize,
+    /// Its time before it was listed.
+    modified: Option<SystemTime>,
+    entries: Box<dyn Iterator<Item = io::Result<Entry>> + Send>,
+}
+
+pub(super) struct Index {
+    root: PathBuf,
+    folders: Vec<Folder>,
+    paths: HashMap<PathBuf, usize>,
+    /// The folder that is asked next.
+    at: usize,
+    listing: Option<Listing>,
+    /// The folder of each file, by the hash of the file's name: of several, the first by path.
+    files: HashMap<u64, usize>,
+    /// Files that may be projects of TrakEM2, below the root.
+    projects: BTreeSet<PathBuf>,
+    changed: bool,
+    went_round: bool,
+}
+
+/// The hash by which a name or path is known.
+pub(super) fn key(name: &str) -> u64 {
+    BuildHasherDefault::<DefaultHasher>::default().hash_one(name)
+}
+
+/// A path's last part; lists are written by programs that separate folders by either slash.
+pub(super) fn base(file: &str) -> &str {
+    file.rsplit(['/', '\\']).next().unwrap_or(file)
+}
+
+impl Index {
+    pub(super) fn new(root: &Path) -> Self {
+        let whole = Folder {
+            path: PathBuf::new(),
+            listed: None,
+            closed: None,
+        };
+        Self {
+            root: root.to_owned(),
+            folders: vec![whole],
+            paths: HashMap::from([(PathBuf::new(), 0)]),
+            at: 0,
+            listing: None,
+            files: HashMap::new(),
+            projects: BTreeSet::new(),
+            changed: false,
+            went_round: false,
+        }
+    }
+
+    /// Whether all was looked through once.
+    pub(super) fn is_whole(&self) -> bool {
+        self.went_round
+    }
+
+    pub(super) fn projects(&self) -> impl Iterator<Item = &Path> {
+        self.projects.iter().map(PathBuf::as_path)
+    }
+
+    /// The image that a list calls `file`, below the root: at that path, else by name alone.
+    pub(super) fn find(&mut self, file: &str) -> Option<String> {
+        let named = image_path(Path::new(""), file);
+        if let Some(named) = named.filter(|path| self.root.join(path).is_file()) {
+            let plain: PathBuf = named.components().collect();
+            return plain.to_str().map(ToOwned::to_owned);
+        }
+        let name = base(file);
+        let folder = *self.files.get(&key(name))?;
+        let path = self.folders[folder].path.join(name);
+        if self.root.join(&path).is_file() {
+            return path.to_str().map(ToOwned::to_owned);
+        }
+        // It is gone; another of its name may be there.
+        self.files.remove(&key(name));
+        for folder in &mut self.folders {
+            folder.listed = None;
+        }
+        None
+    }
+
+    /// Whether the image that was found is the one that a list calls `file`: as long as it has that name, and there is
+    /// none at that path.
+    pub(super) fn is_still(&self, found: &str, file: &str) -> bool {
+        let named =
+            image_path(Path::new(""), file).map(|path| path.components().collect::<PathBuf>());
+        base(found) == base(file)
+            && named
+                .is_none_or(|named| named == Path::new(found) || !self.root.join(named).is_file())
+    }
+
+    /// Goes on with the round of the folders, to its end or with so many questions: the files of folders that
+    /// changed, below the root, and what to do next.
+    pub(super) fn look(
+        &mut self,
+        disk: &impl Folders,
+        budget: usize,
+    ) -> io::Result<(Vec<String>, Next)> {
+        let mut met = Vec::new();
+        for _ in 0..budget.max(1) {
+            if self.listing.is_some() {
+                self.step(&mut met);
+                continue;
+            }
+            let Some(folder) = self.folders.get(self.at) else {
+                self.at = 0;
+                self.went_round = true;
+                let next = match std::mem::take(&mut self.changed) {
+                    true => Next::Again,
+                    false => Next::Rest,
+                };
+                return Ok((met, next));
+            };
+            let path = self.root.join(&folder.path);
+            let listed = folder.listed;
+            let asked = disk.modified(&path).and_then(|modified| {
+                let changed = listed != Some(modified);
+                let entries = changed.then(|| disk.list(&path)).transpose()?;
+                Ok((modified, entries))
+            });
+            let closed = match asked {
+                Ok((modified, entries)) => {
+                    if let Some(entries) = entries {
+                        let age = disk.now().duration_since(modified);
+                        let settled = age.is_ok_and(|age| age > SETTLED);
+                        self.changed = true;
+                        self.listing = Some(Listing {
+                            folder: self.at,
+                            modified: settled.then_some(modified),
+                            entries,
+                        });
+                    }
+                    None
+                }
+                Err(e) if self.at == 0 => return Err(e),
+                Err(e) => {
+                    // Once for each reason.
+                    if self.folders[self.at].closed != Some(e.kind()) {
+                        log::warn!("cannot look into {}: {e}", path.display());
+                    }
+                    Some(e.kind())
+                }
+            };
+            self.folders[self.at].closed = closed;
+            self.at += 1;
+        }
+        Ok((met, Next::More))
+    }
+
+    /// One entry of the folder that is being listed.
+    fn step(&mut self, met: &mut Vec<String>) {
+        let Some(listing) = &mut self.listing else {
+            return;
+        };
+        let at = listing.folder;
+        let Entry { name, folder } = match listing.entries.next() {
+            Some(Ok(entry)) => entry,
+            end => {
+                // One that broke off is listed again.
+                self.folders[at].listed = listing.modified.filter(|_| end.is_none());
+                self.listing = None;
+                return;
+            }
+        };
+        let path = self.folders[at].path.join(&name);
+        if folder {
+            if !self.paths.contains_key(&path) {
+                self.paths.insert(path.clone(), self.folders.len());
+                self.folders.push(Folder {
+                    path,
+                    listed: None,
+                    closed: None,
+                });
+            }
+            return;
+        }
+        let known = self.files.entry(key(&name)).or_insert(at);
+        if self.folders[at].path.join(&name) < self.folders[*known].path.join(&name) {
+            *known = at;
+        }
+        if path
+            .extension()
+            .is_some_and(|e| e.eq_ignore_ascii_case("xml"))
+        {
+            self.projects.insert(path.clone());
+        }
+        // Folders whose names are text hold only such.
+        met.extend(path.to_str().map(ToOwned::to_owned));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::super::super::Disk;
+    use super::*;
+
+    #[test]
+    fn files_are_found_at_their_path_or_by_name_wherever_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |file: &str| {
+            let path = folder.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        };
+        for file in ["z/a.tif", "deep/er/a.tif", "b.tif", "deep/p.XML"] {
+            write(file);
+        }
+        let mut index = Index::new(folder.path());
+        let round = |index: &mut Index| {
+            let mut all = Vec::new();
+            loop {
+                let (met, next) = index.look(&Disk, 2).unwrap();
+                assert!(met.len() <= 2);
+                all.extend(met);
+                if next != Next::More {
+                    all.sort();
+                    return all;
+                }
+            }
+        };
+        assert_eq!(
+            round(&mut index),
+            ["b.tif", "deep/er/a.tif", "deep/p.XML", "z/a.tif"]
+        );
+        assert!(index.is_whole());
+        let mut find = |file: &str| index.find(file);
+        assert_eq!(find("z/a.tif").unwrap(), "z/a.tif");
+        assert_eq!(find("./z/../a.tif"), Some("deep/er/a.tif".to_owned()));
+        assert_eq!(find("/scope/x/a.tif").unwrap(), "deep/er/a.tif");
+        assert_eq!(find("C:\\x\\b.tif").unwrap(), "b.tif");
+        assert_eq!(find("c.tif"), None);
+        assert_eq!(
+            index.projects().collect::<Vec<_>>(),
+            [Path::new("deep/p.XML")]
+        );
+
+        // One that goes away uncovers the next; one that comes is met.
+        fs::remove_file(folder.path().join("deep/er/a.tif")).unwrap();
+        write("new/c.tif");
+        assert_eq!(index.find("a.tif"), None);
+        assert!(round(&mut index).contains(&"new/c.tif".to_owned()));
+        assert_eq!(index.find("a.tif").unwrap(), "z/a.tif");
+        assert_eq!(index.find("c.tif").unwrap(), "new/c.tif");
+    }
+}

@@ -1,0 +1,179 @@
+//! The list is read again, and what it says now is taken over.
+
+use std::collections::{HashMap, HashSet};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use glam::UVec2;
+use saccade_archive::acquisition::{AcquisitionError, DeleteRecord, Record, TransformRecord};
+use saccade_core::transform::SectionFromTile;
+
+use super::super::{BEFORE_FIRST, Folders};
+use super::index::{base, key};
+use super::source::{self, Listing, State, adopt, raw, solution_again};
+use super::{Image, ListError, ListWatch, Tile, Trouble, Wanted, frame};
+
+impl<F: Folders> ListWatch<F> {
+    /// Reads the list if it has changed and rests. Whether it may soon be read.
+    pub(super) fn read_list(&mut self, now: SystemTime) -> Result<bool, ListError> {
+        let projects = self.index.projects().map(|path| self.folder.join(path));
+        let mut projects: Vec<PathBuf> = projects.collect();
+        projects.sort_by_key(|path| (path.components().count(), path.clone()));
+        let age = match self.files.look(&self.disk, &projects) {
+            State::Gone => {
+                let path = self.config.list.clone();
+                return Err(ListError::Gone { path });
+            }
+            State::Same => return self.troubled(),
+            State::Changed(age) if age < self.config.rest => return Ok(true),
+            State::Changed(age) => age,
+        };
+        self.trouble = None;
+        let listing = match source::read(&self.config.list) {
+            Ok(listing) if listing.tiles.is_empty() => {
+                self.trouble = Some(Trouble::Empty);
+                self.files.are_read();
+                return self.troubled();
+            }
+            Ok(listing) => listing,
+            Err(e) => return self.unreadable(e),
+        };
+        let known: HashSet<&str> = listing.tiles.iter().map(|tile| &*tile.name).collect();
+        let dropped =
+            |(name, tile): (&Arc<str>, &Tile)| tile.told.is_some() && !known.contains(&**name);
+        // Half of a list looks like a list.
+        if age < 4 * self.config.rest && self.tiles.iter().any(dropped) {
+            return Ok(true);
+        }
+        if self.frame.is_none() {
+            let begun = frame::begin(
+                &self.config,
+                &self.folder,
+                &mut self.index,
+                &listing,
+                &projects,
+            );
+            let (frame, adopted) = begun?;
+            frame.keep(&self.folder, &self.kept)?;
+            frame::keep_adopted(adopted.as_ref(), &self.folder, &self.kept)?;
+            (self.frame, self.adopted) = (Some(frame), adopted);
+        } else if let Some(adopted) = &mut self.adopted {
+            match solution_again(&adopted.solution.path, listing.own.as_ref()) {
+                Ok(solution) => adopted.solution = solution,
+                Err(e) => return self.unreadable(e),
+            }
+        } else {
+            let size = |n: usize| {
+                let told = self.tiles.get(&*listing.tiles[n].name);
+                told.and_then(|t| t.told.as_ref())
+                    .map_or(UVec2::ONE, |told| told.size)
+            };
+            match adopt(&listing, &projects, raw(&listing.tiles, size)) {
+                Ok(None) => {}
+                Ok(Some(adopted)) => {
+                    let path = adopted.solution.path.display();
+                    log::info!("tiles lie where registration has put them from now on: {path}");
+                    frame::keep_adopted(Some(&adopted), &self.folder, &self.kept)?;
+                    self.adopted = Some(adopted);
+                }
+                Err(e) => return self.unreadable(e),
+            }
+        }
+        self.files.are_read();
+        self.enter(listing, now);
+        Ok(false)
+    }
+
+    fn unreadable(&mut self, error: AcquisitionError) -> Result<bool, ListError> {
+        self.trouble = Some(Trouble::Unreadable(Arc::new(error)));
+        self.files.are_read();
+        self.troubled()
+    }
+
+    fn troubled(&self) -> Result<bool, ListError> {
+        match self.trouble.clone() {
+            None => Ok(false),
+            Some(Trouble::Unreadable(source)) => Err(ListError::List { source }),
+            Some(Trouble::Empty) => Err(ListError::Empty {
+                path: self.config.list.clone(),
+            }),
+        }
+    }
+
+    /// Takes over what the list says now.
+    fn enter(&mut self, listing: Listing, now: SystemTime) {
+        let Some(frame) = self.frame.clone() else {
+            return;
+        };
+        for tile in self.tiles.values_mut() {
+            tile.wanted = None;
+        }
+        self.missing.clear();
+        let before = std::mem::take(&mut self.unread).into_iter();
+        let mut before: HashMap<_, _> =
+            before.map(|unread| (unread.tile.clone(), unread)).collect();
+        for named in listing.tiles {
+            let solved = self
+                .adopted
+                .as_ref()
+                .and_then(|adopted| adopted.place(&named));
+            let transform = frame.place(solved.unwrap_or(named.stage));
+            let section = named
+                .section
+                .checked_sub(frame.first)
+                .unwrap_or(BEFORE_FIRST);
+            let name: Arc<str> = named.name.into();
+            let names = self.by_name.entry(key(base(&named.file))).or_default();
+            if !names.contains(&name) {
+                names.push(Arc::clone(&name));
+            }
+            let tile = self.tiles.entry(Arc::clone(&name)).or_default();
+            let image = match &mut tile.told {
+                Some(told)
+                    if self.index.is_still(&told.file, &named.file)
+                        && (told.section, told.size == UVec2::ZERO) == (section, false) =>
+                {
+                    if !same_place(told.transform, transform) {
+                        told.transform = transform;
+                        let record = TransformRecord {
+                            tile: name.to_string(),
+                            transform,
+                        };
+                        self.untold.push_back((Record::Transform(record), None));
+                    }
+                    Image::Told
+                }
+                _ => Image::Missing,
+            };
+            tile.wanted = Some(Wanted {
+                file: named.file,
+                section,
+                transform,
+                image,
+            });
+            if image == Image::Missing {
+                self.look_for(&name, now);
+            }
+        }
+        for unread in &mut self.unread {
+            if let Some(before) = before.remove(&unread.tile) {
+                *unread = before;
+            }
+        }
+        let untold = &mut self.untold;
+        self.tiles.retain(|name, tile| {
+            if tile.wanted.is_none() && tile.told.is_some() {
+                let tile = name.to_string();
+                untold.push_back((Record::Delete(DeleteRecord { tile }), None));
+            }
+            tile.wanted.is_some()
+        });
+    }
+}
+
+/// Whether two transforms say the same; text may lose a number's last bit.
+fn same_place(a: SectionFromTile, b: SectionFromTile) -> bool {
+    let mut pairs = a.elements().into_iter().zip(b.elements());
+    pairs.all(|(a, b)| (a - b).abs() <= 1e-12 * a.abs().max(1.0))
+}

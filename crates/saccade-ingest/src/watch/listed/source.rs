@@ -1,0 +1,251 @@
+//! The list as it stands in its file, and what registration made of it.
+
+use std::collections::{BTreeSet, HashSet};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use glam::{DVec2, UVec2};
+use saccade_archive::acquisition::{AcquisitionError, tile_configuration, trakem2};
+use saccade_core::transform::SectionFromTile;
+
+use super::super::{Folders, Stamp};
+use crate::replay::RawTile;
+use crate::replay::acquisition::median_offset;
+use crate::replay::detect::{LARGEST_LIST, best};
+use crate::replay::lists::{self, Solution, is_project};
+
+/// A tile that a list names.
+#[derive(Clone, Debug)]
+pub(super) struct Named {
+    /// Its name in the volume.
+    pub(super) name: String,
+    /// The file's name without folder and extension: what solutions call it.
+    pub(super) stem: String,
+    /// The image as the list names it.
+    pub(super) file: String,
+    /// Section as the list counts them.
+    pub(super) section: u32,
+    /// Where the list says that it lies \[pixels\].
+    pub(super) stage: SectionFromTile,
+}
+
+/// What the files say.
+pub(super) struct Listing {
+    /// By section, then as listed.
+    pub(super) tiles: Vec<Named>,
+    /// What the list's own program found.
+    pub(super) own: Option<Solution>,
+}
+
+/// Reads a list, or a TrakEM2 project as one.
+pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
+    let is_xml = path
+        .extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case("xml"));
+    let (tiles, own): (Vec<_>, _) = if is_xml {
+        let patches = trakem2::read(path)?;
+        let tiles = patches.into_iter().map(|patch| {
+            let stem = patch.name().to_owned();
+            (stem, patch.file, patch.section, patch.transform)
+        });
+        (tiles.collect(), None)
+    } else {
+        let list = lists::read(path)?;
+        let tiles = list.tiles.into_iter().map(|tile| {
+            let stem = tile.name().to_owned();
+            let stage = SectionFromTile::translation(tile.corner);
+            (stem, tile.file, tile.section, stage)
+        });
+        (tiles.collect(), list.solution)
+    };
+    let mut taken = HashSet::new();
+    let named = tiles.into_iter().map(|(stem, file, section, stage)| Named {
+        name: unique(&stem, &file, &mut taken),
+        stem,
+        file,
+        section,
+        stage,
+    });
+    let mut tiles: Vec<_> = named.collect();
+    tiles.sort_by_key(|tile| tile.section);
+    Ok(Listing { tiles, own })
+}
+
+/// A name that no tile listed before has, so that what comes later in the list changes none.
+fn unique(stem: &str, file: &str, taken: &mut HashSet<String>) -> String {
+    let safe = |text: &str| -> String {
+        let fit = |c: char| {
+            if c.is_alphanumeric() || "-_.".contains(c) {
+                c
+            } else {
+                '_'
+            }
+        };
+        text.chars().map(fit).collect()
+    };
+    let whole = file.trim_start_matches(['/', '.', '\\']);
+    let whole = whole.rsplit_once('.').map_or(whole, |(before, _)| before);
+    let again = (2..).map(|n: u64| format!("{}-{n}", safe(whole)));
+    let mut names = [safe(stem), safe(whole)].into_iter().chain(again);
+    let name = names.find(|name| !name.is_empty() && !taken.contains(name));
+    let name = name.unwrap_or_default();
+    taken.insert(name.clone());
+    name
+}
+
+/// The solution that is used.
+#[derive(Debug)]
+pub(super) struct Adopted {
+    pub(super) solution: Solution,
+    /// How far its frame is from the list's \[pixels\].
+    pub(super) offset: DVec2,
+}
+
+impl Adopted {
+    /// Where it says that a tile lies, in the list's frame.
+    pub(super) fn place(&self, tile: &Named) -> Option<SectionFromTile> {
+        let transform = self.solution.transforms.get(&tile.stem)?;
+        Some(transform.shifted(-self.offset))
+    }
+}
+
+/// Tiles as replay knows them.
+pub(super) fn raw(tiles: &[Named], size: impl Fn(usize) -> UVec2) -> Vec<RawTile> {
+    let raw = tiles.iter().enumerate().map(|(n, tile)| RawTile {
+        name: tile.stem.clone(),
+        image: PathBuf::new(),
+        section: tile.section,
+        size: size(n),
+        stage: tile.stage,
+        aligned: None,
+    });
+    raw.collect()
+}
+
+/// Chooses a solution as replay does: the list's own or that of a project. Its frame becomes that of the list, from
+/// which it then refines.
+pub(super) fn adopt(
+    listing: &Listing,
+    projects: &[PathBuf],
+    mut raw: Vec<RawTile>,
+) -> Result<Option<Adopted>, AcquisitionError> {
+    let wanted: BTreeSet<&str> = listing.tiles.iter().map(|t| t.stem.as_str()).collect();
+    // Names that mean several tiles cannot be looked up.
+    if wanted.len() < listing.tiles.len() || wanted.is_empty() {
+        return Ok(None);
+    }
+    let mut solutions = Vec::from_iter(listing.own.clone());
+    let small = |path: &&PathBuf| path.metadata().is_ok_and(|meta| meta.len() <= LARGEST_LIST);
+    for project in projects.iter().filter(small).filter(|p| is_project(p)) {
+        solutions.push(Solution::read(project)?);
+    }
+    let Some(solution) = best(&wanted, &raw, solutions) else {
+        return Ok(None);
+    };
+    for tile in &mut raw {
+        tile.aligned = solution.transforms.get(&tile.name).copied();
+    }
+    let offset = median_offset(&raw).unwrap_or_default();
+    Ok(Some(Adopted { solution, offset }))
+}
+
+/// The solution in that file as it is now.
+pub(super) fn solution_again(
+    path: &Path,
+    own: Option<&Solution>,
+) -> Result<Solution, AcquisitionError> {
+    match own.filter(|own| own.path == path) {
+        Some(own) => Ok(own.clone()),
+        None if path
+            .extension()
+            .is_some_and(|e| e.eq_ignore_ascii_case("xml")) =>
+        {
+            Solution::read(path)
+        }
+        None => Err(AcquisitionError::Read {
+            source: io::ErrorKind::NotFound.into(),
+            path: path.to_owned(),
+        }),
+    }
+}
+
+/// Tells when the files that make a list have changed, and rest.
+#[derive(Debug)]
+pub(super) struct Files {
+    list: PathBuf,
+    /// What they looked like when they were read.
+    read: Option<Vec<Option<Stamp>>>,
+    /// What they look like, and since when.
+    now: (Vec<Option<Stamp>>, SystemTime),
+}
+
+/// How the files are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// As they were read.
+    Same,
+    /// Others than were read, for that long.
+    Changed(Duration),
+    /// The list is not there.
+    Gone,
+}
+
+impl Files {
+    pub(super) fn new(list: &Path) -> Self {
+        Self {
+            list: list.to_owned(),
+            read: None,
+            now: (Vec::new(), SystemTime::UNIX_EPOCH),
+        }
+    }
+
+    /// Looks at the list, at what Fiji makes of it, and at others that count.
+    pub(super) fn look(&mut self, disk: &impl Folders, others: &[PathBuf]) -> State {
+        let registered = tile_configuration::registered(&self.list);
+        let files = [&self.list, &registered].into_iter().chain(others);
+        let looks: Vec<_> = files.map(|file| disk.stamp(file).ok()).collect();
+        let now = disk.now();
+        let Some(list) = looks[0] else {
+            return State::Gone;
+        };
+        if self.now.0 != looks {
+            // One that was there before anybody looked has rested since it was written.
+            let last = looks.iter().flatten().map(Stamp::last).max();
+            let since = match self.now.0.is_empty() {
+                true => last.unwrap_or(list.modified).min(now),
+                false => now,
+            };
+            self.now = (looks, since);
+        }
+        if self.read.as_ref() == Some(&self.now.0) {
+            return State::Same;
+        }
+        State::Changed(now.duration_since(self.now.1).unwrap_or_default())
+    }
+
+    /// They are read as they looked last.
+    pub(super) fn are_read(&mut self) {
+        self.read = Some(self.now.0.clone());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_listed_later_changes_no_name() {
+        let mut taken = HashSet::new();
+        let mut name = |stem: &str, file: &str| unique(stem, file, &mut taken);
+        let names = [
+            name("a", "x/a.tif"),
+            name("a", "y/a.tif"),
+            name("a b", "/z/a b.tif"),
+            name("a", "y/a.tif"),
+            name("", "?"),
+            name("a", "y/a.tif"),
+        ];
+        assert_eq!(names, ["a", "y_a", "a_b", "y_a-2", "_", "y_a-3"]);
+    }
+}

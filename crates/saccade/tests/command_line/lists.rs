@@ -1,0 +1,207 @@
+//! Folders whose tiles a list names, through the program alone.
+
+use std::io::{BufRead as _, BufReader};
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::mpsc::channel;
+use std::time::Duration;
+
+use image::{GrayImage, Luma};
+
+use super::errors::{assert_failed, text};
+use super::server_away::says;
+use super::update::ended;
+use super::{Running, done, run, saccade, stderr};
+
+fn picture(folder: &Path, name: &str, shade: u8) {
+    let image = GrayImage::from_fn(40, 30, |x, y| {
+        Luma([shade + u8::try_from((x + y) % 9).unwrap()])
+    });
+    image.save(folder.join(name)).unwrap();
+}
+
+#[test]
+fn a_folder_with_a_list_is_taken_in() {
+    let folder = tempfile::tempdir().unwrap();
+    let scope = folder.path().join("cortex");
+    let archive = folder.path().join("archive");
+    std::fs::create_dir(&scope).unwrap();
+    let list = scope.join("TileConfiguration.txt");
+    std::fs::write(&list, "dim = 2\na.png; ; (100, 100)\nb.png; ; (135, 100)\n").unwrap();
+    let ingest = ["ingest", text(&scope), text(&archive), "--once"];
+    let sized = [&ingest[..], &["--voxel", "4,4,40"]].concat();
+
+    // What a list cannot say is asked for, before anything is made.
+    assert_failed(
+        &run(ingest),
+        1,
+        &["how large a voxel is", "--voxel", text(&list)],
+    );
+    assert!(!archive.exists());
+    let none = run(&sized);
+    assert_failed(&none, 1, &["none of the 2 images", "a.png", "--extent"]);
+
+    picture(&scope, "a.png", 10);
+    let half = run(&sized);
+    let said = [
+        "1 tiles taken in",
+        "1 of the 2 images",
+        "b.png",
+        "started again",
+    ];
+    ended(&half, 3, &said);
+    picture(&scope, "b.png", 90);
+    let whole = done(&sized);
+    assert!(
+        stderr(&whole).contains("1 tiles taken in"),
+        "{}",
+        stderr(&whole)
+    );
+    let again = done(&sized);
+    assert!(
+        stderr(&again).contains("0 tiles taken in"),
+        "{}",
+        stderr(&again)
+    );
+
+    // It is known by its first options and its list.
+    let other = [&sized[..], &["--first", "3"]].concat();
+    assert_failed(
+        &run(other),
+        1,
+        &["first is 0 there, 3 now", "--volume NAME"],
+    );
+    std::fs::copy(&list, scope.join("TileConfiguration0.txt")).unwrap();
+    done(&sized);
+    let second = scope.join("TileConfiguration0.txt");
+    let other = [&sized[..], &["--list", text(&second)]].concat();
+    assert_failed(&run(other), 1, &["list is TileConfiguration.txt there"]);
+    let pattern = [
+        &sized[..],
+        &[
+            "--pattern",
+            "{section}.png",
+            "--extent",
+            "9,9,9",
+            "--pitch",
+            "9,9",
+        ],
+    ];
+    assert_failed(
+        &run(pattern.concat()),
+        1,
+        &["pattern is not set there", "list is"],
+    );
+
+    // The tiles can be moved by others, too.
+    let moves = folder.path().join("moves.jsonl");
+    let line = r#"{"record": "transform", "tile": "b", "transform": [1, 0, 0, 1, 33, 0]}"#;
+    std::fs::write(&moves, line).unwrap();
+    let moved = done(["update", text(&archive), text(&moves)]);
+    assert!(stderr(&moved).contains("1 moved"), "{}", stderr(&moved));
+    done(&sized);
+    let again = done(["update", text(&archive), text(&moves)]);
+    assert!(
+        stderr(&again).contains("0 moved, 1 unchanged"),
+        "{}",
+        stderr(&again)
+    );
+}
+
+#[test]
+fn options_of_lists_are_for_lists() {
+    let folder = tempfile::tempdir().unwrap();
+    let acquisition = folder.path().join("acquisition");
+    let archive = folder.path().join("archive");
+    super::simulate(&acquisition, "150,130,12");
+    let ingest = ["ingest", text(&acquisition), text(&archive), "--once"];
+    for (option, value) in [("--extent", "9,9,9"), ("--first", "3"), ("--bits", "8")] {
+        let refused = run([&ingest[..], &[option, value]].concat());
+        assert_failed(&refused, 1, &["has records", option, "leave it out"]);
+    }
+    let scope = folder.path().join("scope");
+    std::fs::create_dir(&scope).unwrap();
+    picture(&scope, "a.png", 10);
+    let list = scope.join("list.txt");
+    std::fs::write(&list, "a.png 1 2\n").unwrap();
+    let ingest = [
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--once",
+        "--voxel",
+        "4",
+    ];
+    let named = |list: &str| run([&ingest[..], &["--list", list]].concat());
+    assert_failed(
+        &named(text(&list)),
+        1,
+        &["list", "line 1", "a.png 1 2", text(&list)],
+    );
+    assert_failed(&named("nowhere.txt"), 1, &["not there", "nowhere.txt"]);
+    let alone = run([
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--list",
+        text(&list),
+    ]);
+    assert_failed(&alone, 2, &["--voxel"]);
+    let far = "tiles lie within";
+    let listed = run([&ingest[..], &["--list", text(&list), "--origin", "1e12,3"]].concat());
+    assert_failed(&listed, 2, &[far]);
+    assert!(!archive.join("catalog.sqlite").exists());
+}
+
+/// Followed, until it is told to end; a list that grows is taken in meanwhile.
+#[test]
+fn a_list_that_grows_is_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    let scope = folder.path().join("cortex");
+    let archive = folder.path().join("archive");
+    std::fs::create_dir(&scope).unwrap();
+    let list = scope.join("list.txt");
+    std::fs::write(&list, "a.png 0 0 0\n").unwrap();
+    picture(&scope, "a.png", 10);
+    let options = ["--voxel", "4,4,40", "--extent", "200,100,4", "--lossless"];
+    let ingest = ["ingest", text(&scope), text(&archive)];
+    let mut following = saccade();
+    following.args(ingest).args(options).stderr(Stdio::piped());
+    let mut following = Running(following.spawn().unwrap());
+    let (send, said) = channel();
+    let stderr_of = BufReader::new(following.0.stderr.take().unwrap());
+    std::thread::spawn(move || {
+        for line in stderr_of.lines().map_while(Result::ok) {
+            if send.send(line).is_err() {
+                return;
+            }
+        }
+    });
+    let tiles = |want: usize| {
+        for _ in 0..400 {
+            let catalog = archive.join("catalog.sqlite");
+            let check = catalog.exists().then(|| run(["check", text(&archive)]));
+            if check.is_some_and(|check| stderr(&check).contains(&format!("{want} tiles"))) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        panic!("{want} tiles do not come");
+    };
+    tiles(1);
+    std::fs::write(&list, "a.png 0 0 0\nb.png 35 0 0\nc.png 0 0 1\n").unwrap();
+    picture(&scope, "b.png", 20);
+    picture(&scope, "c.png", 30);
+    tiles(3);
+    std::fs::write(&list, "a.png 0 0 0\nc.png 0 0 1\n").unwrap();
+    tiles(2);
+    // What it knows no more is told, and ends nothing.
+    std::fs::write(&list, "a.png 0 0\n").unwrap();
+    says(&said, "line 1");
+    std::fs::write(&list, "a.png 0 0 0\nc.png 0 0 1\n").unwrap();
+    says(&said, "can be read again");
+    let id = following.0.id().to_string();
+    let told = Command::new("kill").args(["-TERM", &id]).status();
+    assert!(told.unwrap().success());
+    assert!(following.0.wait().unwrap().success());
+}
