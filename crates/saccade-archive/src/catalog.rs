@@ -590,6 +590,23 @@ impl Catalog {
         self.ask(question, &[id.into()], rows::quarantined).await
     }
 
+    /// The first `most` of them.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::quarantined`].
+    pub async fn first_quarantined(
+        &self,
+        volume: &str,
+        most: u32,
+    ) -> Result<Vec<Quarantined>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = $1 \
+                        ORDER BY id LIMIT $2";
+        let values = [id.into(), most.into()];
+        self.ask(question, &values, rows::quarantined).await
+    }
+
     /// How far the records were read.
     ///
     /// # Errors
@@ -654,6 +671,40 @@ impl Catalog {
         }
     }
 
+    /// The sections that have a tile, by looking at the tiles themselves: what [`Self::sections`] should say.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::sections`].
+    pub async fn sections_of_tiles(&self, volume: &str) -> Result<Vec<u32>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT DISTINCT section FROM tiles WHERE volume = $1 AND deleted = 0 \
+                        ORDER BY section";
+        self.ask(question, &[id.into()], rows::section).await
+    }
+
+    /// Counts a volume's tiles anew, in all and by section.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn recount(&self, volume: &str) -> Result<(), CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let mut transaction = self.transaction(Durability::Durable).await?;
+        for statement in [
+            "UPDATE volumes SET tiles = \
+             (SELECT count(*) FROM tiles WHERE volume = $1 AND deleted = 0) WHERE id = $1",
+            "DELETE FROM sections WHERE volume = $1",
+            "INSERT INTO sections (volume, section, tiles) SELECT volume, section, count(*) \
+             FROM tiles WHERE volume = $1 AND deleted = 0 GROUP BY volume, section",
+        ] {
+            let done = transaction.run(statement, &[id.into()]).await;
+            done.map_err(|e| self.failed(e))?;
+        }
+        let done = transaction.commit().await;
+        done.map_err(|e| self.failed(e))
+    }
+
     /// Ends all connections. Without it they end when the last clone is dropped, in their own time.
     pub async fn close(&self) {
         self.inner.database.close().await;
@@ -672,6 +723,14 @@ impl Catalog {
     }
 
     async fn transaction(&self, durability: Durability) -> Result<Transaction, CatalogError> {
+        if let Database::Sqlite(opened) = &self.inner.database
+            && let Some(reason) = opened.stopped()
+        {
+            return Err(CatalogError::NotSynced {
+                reason: reason.to_owned(),
+                location: self.location().clone(),
+            });
+        }
         let begun = Transaction::begin(&self.inner.database, durability).await;
         begun
             .map_err(|e| self.failed(e))?
@@ -703,6 +762,12 @@ impl Catalog {
     }
 
     fn failed(&self, source: sqlx::Error) -> CatalogError {
-        CatalogError::sort(source, &self.inner.location)
+        let error = CatalogError::sort(source, &self.inner.location);
+        if let (CatalogError::NotSynced { reason, .. }, Database::Sqlite(opened)) =
+            (&error, &self.inner.database)
+        {
+            opened.stop(reason);
+        }
+        error
     }
 }

@@ -82,6 +82,13 @@ pub struct Finding {
     pub repair: Option<Repair>,
 }
 
+impl Finding {
+    /// Whether it is mended, or will be.
+    fn is_mended(&self) -> bool {
+        matches!(self.repair, Some(Repair::Queued | Repair::Recounted))
+    }
+}
+
 /// What can be wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -112,6 +119,8 @@ pub enum Repair {
     Deleted,
     /// The tile's record waits for ingest, which makes the pyramid anew.
     Queued,
+    /// The tiles were counted anew.
+    Recounted,
     /// The tile is in quarantine, for its record or image is not to be had.
     Quarantined,
 }
@@ -129,7 +138,7 @@ impl CheckReport {
         let damage = self
             .findings
             .iter()
-            .filter(|finding| finding.kind.is_damage() && finding.repair != Some(Repair::Queued));
+            .filter(|finding| finding.kind.is_damage() && !finding.is_mended());
         damage.count()
     }
 }
@@ -159,7 +168,7 @@ pub enum CheckError {
 /// missing or damaged is given back to ingest if the acquisition still has its record and image,
 /// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
 /// damaged object: ingest replaces it. A folder in the place of a pyramid is found as damage and not repaired:
-/// somebody has to take it away first.
+/// somebody has to take it away first. Wrong counts are made right.
 ///
 /// # Errors
 ///
@@ -209,7 +218,9 @@ impl Check<'_> {
         let catalog = self.archive.catalog();
         let volume = &entry.volume;
         let before = self.report.tiles;
-        for z in catalog.sections(&volume.name).await? {
+        // Not those that are counted: what the counts leave out would be called nobody's.
+        let sections = catalog.sections_of_tiles(&volume.name).await?;
+        for &z in &sections {
             let tiles = catalog.section_tiles(&volume.name, z).await?;
             let looks = tiles.into_iter().map(async |tile| {
                 let looked = self.look(&tile).await;
@@ -226,9 +237,26 @@ impl Check<'_> {
         let tiles = self.report.tiles - before;
         // Others may have entered some meanwhile: only what cannot be so is wrong.
         let now = catalog.entry(&volume.name).await?;
-        if !(entry.tiles.min(now.tiles)..=entry.tiles.max(now.tiles)).contains(&tiles) {
-            let reason = format!("the catalog counts {} tiles, but has {tiles}", now.tiles);
-            self.find(FindingKind::Miscounted, entry, None, reason);
+        let counted = catalog.sections(&volume.name).await?;
+        let still = catalog.sections_of_tiles(&volume.name).await?;
+        let lacks = |z: &&u32| still.binary_search(z).is_ok() && counted.binary_search(z).is_err();
+        let lacks = sections.iter().filter(lacks).count();
+        let all = (entry.tiles.min(now.tiles)..=entry.tiles.max(now.tiles)).contains(&tiles);
+        if !all || lacks > 0 {
+            let reason = format!(
+                "the catalog counts {} tiles, but has {tiles}; of {} sections with tiles it lacks {lacks}",
+                now.tiles,
+                sections.len()
+            );
+            let repair = match self.options.repair {
+                true => {
+                    catalog.recount(&volume.name).await?;
+                    Some(Repair::Recounted)
+                }
+                false => None,
+            };
+            let found = self.find(FindingKind::Miscounted, entry, None, reason);
+            found.repair = repair;
         }
         let later = SystemTime::now() + Duration::from_secs(1 << 32);
         for retired in catalog.retired(&volume.name, later, u32::MAX).await? {

@@ -192,6 +192,7 @@ impl Transaction {
                     Durability::Soon => "PRAGMA synchronous = NORMAL",
                 };
                 sqlx::query(sync).execute(&mut *connection).await?;
+                opened.tidy(&mut connection).await?;
                 // IMMEDIATE: one that begins by reading could not always go on to write.
                 let begin = "BEGIN IMMEDIATE".into_sql_str();
                 let begun = sqlx::Transaction::begin(connection, Some(begin)).await?;

@@ -185,6 +185,19 @@ pub enum CatalogError {
         /// Where it is.
         location: CatalogLocation,
     },
+    /// A sync failed: what was written before may or may not be on the disk, and a later sync would not
+    /// tell, since the system forgets what it could not write. Nothing is written from here on.
+    #[error(
+        "the catalog could not be made durable ({reason}), and nothing more is written to it: look at \
+         the disk and the system's log, then start again, which takes in what was not acknowledged: \
+         {location}"
+    )]
+    NotSynced {
+        /// What the database says.
+        reason: String,
+        /// Where it is.
+        location: CatalogLocation,
+    },
     /// Anything else; see the source.
     #[error("the catalog could not be read or written: {location}")]
     Database {
@@ -205,6 +218,10 @@ impl CatalogError {
         let location = location.clone();
         match case {
             Case::Full => Self::Full { source, location },
+            Case::NotSynced => Self::NotSynced {
+                reason: source.to_string(),
+                location,
+            },
             Case::Foreign => Self::NotACatalog { location },
             Case::ReadOnly => Self::ReadOnly { location },
             Case::Unreachable => Self::Unreachable { source, location },
@@ -255,6 +272,7 @@ impl CatalogError {
             | Self::Login { location, .. }
             | Self::NotDurable { location, .. }
             | Self::Full { location, .. }
+            | Self::NotSynced { location, .. }
             | Self::Database { location, .. } => Some(location),
             Self::Missed { .. }
             | Self::UnknownVolume { .. }
@@ -283,6 +301,7 @@ impl CatalogError {
 
 enum Case {
     Full,
+    NotSynced,
     Foreign,
     ReadOnly,
     Unreachable,
@@ -292,6 +311,10 @@ enum Case {
 }
 
 fn sqlite_case(error: &sqlx::Error) -> Case {
+    // SQLITE_IOERR_FSYNC, SQLITE_IOERR_DIR_FSYNC.
+    if matches!(code(error), Some(1034 | 1290)) {
+        return Case::NotSynced;
+    }
     match primary_code(error) {
         Some(13) => Case::Full,
         Some(26) => Case::Foreign,
@@ -322,10 +345,14 @@ fn postgres_case(error: &sqlx::Error) -> Case {
     }
 }
 
-/// SQLite's result code without its extension.
+/// SQLite's result code.
+fn code(error: &sqlx::Error) -> Option<u32> {
+    error.as_database_error()?.code()?.parse().ok()
+}
+
+/// The same without its extension.
 fn primary_code(error: &sqlx::Error) -> Option<u32> {
-    let code = error.as_database_error()?.code()?.parse::<u32>().ok()?;
-    Some(code & 0xff)
+    Some(code(error)? & 0xff)
 }
 
 /// PostgreSQL's five characters.

@@ -4,6 +4,9 @@ use std::cmp::Ordering;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+use std::sync::atomic::AtomicU32;
+use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 use sqlx::migrate::{MigrateError, Migrator};
@@ -42,6 +45,8 @@ pub(super) fn options(path: &Path, access: Access) -> SqliteConnectOptions {
             .journal_mode(SqliteJournalMode::Wal)
             // NORMAL would lose acknowledged tiles at a power cut.
             .synchronous(SqliteSynchronous::Full)
+            // By `Opened::tidy`, since SQLite keeps to itself how its own ended.
+            .pragma("wal_autocheckpoint", "0")
             .foreign_keys(true),
         Access::Read => options.read_only(true),
         Access::ReadUnchanging => options.read_only(true).immutable(true),
@@ -57,9 +62,49 @@ pub(super) struct Opened {
     /// none if the file may only be read.
     pub(super) writer: Option<SqlitePool>,
     pub(super) readers: SqlitePool,
+    /// Transactions in the write-ahead log, about.
+    logged: AtomicU32,
+    /// Why nothing may be written any more: a sync failed.
+    stopped: OnceLock<String>,
 }
 
+/// Transactions in the write-ahead log from which on it is emptied: some megabytes.
+const MOST_LOGGED: u32 = 100;
+
 impl Opened {
+    fn new(path: &Path, access: Access, writer: Option<SqlitePool>, readers: SqlitePool) -> Self {
+        Self {
+            path: path.to_owned(),
+            access,
+            writer,
+            readers,
+            // What is there from before is not known.
+            logged: AtomicU32::new(MOST_LOGGED),
+            stopped: OnceLock::new(),
+        }
+    }
+
+    /// Lets nothing be written any more, since a sync failed.
+    pub(super) fn stop(&self, reason: &str) {
+        let _first_reason_stays = self.stopped.set(reason.to_owned());
+    }
+
+    /// Why nothing may be written any more, if so.
+    pub(super) fn stopped(&self) -> Option<&str> {
+        self.stopped.get().map(String::as_str)
+    }
+
+    /// Before a transaction: moves what is in the log to the file once it is long. Where a sync of that
+    /// fails, all is still in the log, and is moved anew when the file is opened the next time.
+    pub(super) async fn tidy(&self, connection: &mut SqliteConnection) -> Result<(), sqlx::Error> {
+        if self.logged.fetch_add(1, Relaxed) >= MOST_LOGGED {
+            let checkpoint = sqlx::query("PRAGMA wal_checkpoint(PASSIVE)");
+            checkpoint.fetch_all(connection).await?;
+            self.logged.store(0, Relaxed);
+        }
+        Ok(())
+    }
+
     pub(super) async fn close(&self) {
         self.readers.close().await;
         if let Some(writer) = &self.writer {
@@ -94,12 +139,7 @@ async fn open_to_write(path: &Path) -> Result<Opened, CatalogError> {
     let writer = connect(writer, options, path).await?;
     migrate(&writer, path).await?;
     let readers = open_readers(path, access).await?;
-    Ok(Opened {
-        path: path.to_owned(),
-        access,
-        writer: Some(writer),
-        readers,
-    })
+    Ok(Opened::new(path, access, Some(writer), readers))
 }
 
 pub(super) async fn open_to_read(path: &Path) -> Result<Opened, CatalogError> {
@@ -112,12 +152,7 @@ pub(super) async fn open_to_read(path: &Path) -> Result<Opened, CatalogError> {
     };
     let readers = open_readers(path, access).await?;
     refuse_other_schema(&readers, path).await?;
-    Ok(Opened {
-        path: path.to_owned(),
-        access,
-        writer: None,
-        readers,
-    })
+    Ok(Opened::new(path, access, None, readers))
 }
 
 async fn open_readers(path: &Path, access: Access) -> Result<SqlitePool, CatalogError> {
@@ -354,6 +389,45 @@ mod tests {
             pyramid: format!("tiles/{name}"),
             position: 0,
         }
+    }
+
+    #[tokio::test]
+    async fn a_full_catalog_is_as_it_was_and_goes_on() {
+        let (_folder, _, catalog) = written().await;
+        let Database::Sqlite(opened) = &catalog.inner.database else {
+            panic!("a file")
+        };
+        // The only connection that writes: what it is told holds for all.
+        let writer = opened.writer.as_ref().unwrap();
+        let pages: i64 = {
+            sqlx::query_scalar("PRAGMA page_count")
+                .fetch_one(writer)
+                .await
+        }
+        .unwrap();
+        let room = |pages: i64| sqlx::AssertSqlSafe(format!("PRAGMA max_page_count = {pages}"));
+        sqlx::query(room(pages)).execute(writer).await.unwrap();
+        let mut entered = 1;
+        let full = loop {
+            match catalog
+                .commit_tile("v", &tile(&format!("t{entered}")))
+                .await
+            {
+                Ok(_) => entered += 1,
+                Err(error) => break error,
+            }
+            assert!(entered < 10_000, "it never fills");
+        };
+        assert!(matches!(full, CatalogError::Full { .. }), "{full}");
+        assert!(
+            full.is_outage() && full.to_string().contains("free some"),
+            "{full}"
+        );
+        let count = async || catalog.entry("v").await.unwrap().tiles;
+        assert_eq!(count().await, entered);
+        sqlx::query(room(1 << 30)).execute(writer).await.unwrap();
+        catalog.commit_tile("v", &tile("again")).await.unwrap();
+        assert_eq!(count().await, entered + 1);
     }
 
     async fn to_read(path: &Path) -> Catalog {

@@ -371,3 +371,30 @@ async fn a_folder_in_the_place_of_a_pyramid_is_told_and_the_others_are_repaired(
     let waiting: Vec<_> = waiting.into_iter().map(|w| w.record.tile).collect();
     assert_eq!(waiting, ["t3", "t4"]);
 }
+
+#[tokio::test]
+async fn wrong_counts_are_made_right() {
+    let fixture = Fixture::new().await;
+    let file = fixture.folder.path().join("catalog.sqlite");
+    let meddle = sqlx::SqlitePool::connect(file.to_str().unwrap()).await;
+    let meddle = meddle.unwrap();
+    for statement in [
+        "UPDATE volumes SET tiles = 99",
+        "DELETE FROM sections WHERE section = 1",
+    ] {
+        sqlx::query(statement).execute(&meddle).await.unwrap();
+    }
+    let mut options = CheckOptions::default();
+    let catalog = fixture.archive.catalog();
+    for (repair, expected) in [(false, None), (true, Some(Repair::Recounted))] {
+        options.repair = repair;
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let found: Vec<_> = report.findings.iter().map(|f| (f.kind, f.repair)).collect();
+        assert_eq!(found, [(FindingKind::Miscounted, expected)]);
+        assert_eq!(report.damage(), usize::from(!repair));
+    }
+    assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, u64::from(TILES));
+    assert_eq!(catalog.sections(VOLUME).await.unwrap(), [0, 1, 2]);
+    let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+    assert_eq!(report.findings, []);
+}

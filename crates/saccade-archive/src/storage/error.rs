@@ -135,11 +135,40 @@ impl StorageError {
         self.is_outage() || matches!(self, Self::Io { .. })
     }
 
+    /// Whether this process, or the system, has too many files open: nothing is wrong with what was asked for.
+    pub fn is_shortage(&self) -> bool {
+        // EMFILE, ENFILE: the same on all systems.
+        const TOO_MANY: [i32; 2] = [24, 23];
+        match self {
+            Self::Io { source, .. } => {
+                { source.raw_os_error() }.is_some_and(|n| TOO_MANY.contains(&n))
+            }
+            _ => false,
+        }
+    }
+
     /// Whether nothing but waiting helps, however long: the disk is full or not mounted, the object store is away.
     pub fn is_outage(&self) -> bool {
         matches!(
             self,
             Self::Full { .. } | Self::Away { .. } | Self::Unavailable { .. }
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn too_many_open_files_are_no_damage() {
+        let error = |number| {
+            let source = io::Error::from_raw_os_error(number);
+            StorageError::new(source, "a", "/srv/a".to_owned())
+        };
+        // EMFILE, ENFILE; EIO, ENOENT.
+        for (number, shortage) in [(24, true), (23, true), (5, false), (2, false)] {
+            assert_eq!(error(number).is_shortage(), shortage, "{number}");
+        }
     }
 }

@@ -104,6 +104,7 @@ fn line(finding: &Finding) -> String {
     line.push_str(&format!(": {}", finding.reason));
     line.push_str(match finding.repair {
         Some(Repair::Deleted) => "; deleted",
+        Some(Repair::Recounted) => "; counted anew",
         Some(Repair::Queued) => "; `saccade ingest` makes it anew",
         Some(Repair::Quarantined) => "; set aside: append its record once more",
         _ => "",

@@ -13,7 +13,7 @@ use super::{DirEntry, Disk, FolderId, Metadata, OpenFile};
 /// A file system in memory whose power can be cut after any step.
 ///
 /// What a power cut leaves is what was synced, and any part of what was not: of a file's bytes any
-/// number, the last ones possibly as zeros; of a folder's changes any subset, a rename being one
+/// number, the last ones possibly as zeros, or any of its sectors; of a folder's changes any subset, a rename being one
 /// change in each of two folders. So it keeps what every file system keeps, and no more. Clones share
 /// it.
 #[derive(Clone, Debug)]
@@ -58,6 +58,8 @@ enum Node {
 type Change = (OsString, Option<usize>);
 
 const ROOT: usize = 0;
+/// What a disk writes whole or not at all \[bytes\].
+const SECTOR: usize = 512;
 
 impl Node {
     fn dir() -> Self {
@@ -289,15 +291,28 @@ fn copy_what_is_left(old: &State, from: usize, new: &mut State, to: usize, crash
 fn bytes_left(bytes: &[u8], durable: usize, crash: &mut Crash) -> Vec<u8> {
     let pending = bytes.len() - durable;
     let some = |crash: &mut Crash| durable + crash.below(pending + 1);
-    match crash.below(4) {
+    match crash.below(5) {
         0 => bytes[..durable].to_vec(),
         1 => bytes.to_vec(),
         2 => bytes[..some(crash)].to_vec(),
         // The length is there, the bytes are not.
-        _ => {
+        3 => {
             let kept = some(crash);
             let mut left = bytes.to_vec();
             left[kept..].fill(0);
+            left
+        }
+        // Each sector for itself, in whatever order the disk took them.
+        _ => {
+            let mut left = bytes.to_vec();
+            let mut first = durable;
+            while first < left.len() {
+                let end = (first / SECTOR * SECTOR + SECTOR).min(left.len());
+                if crash.below(2) == 0 {
+                    left[first..end].fill(0);
+                }
+                first = end;
+            }
             left
         }
     }
