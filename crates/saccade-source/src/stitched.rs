@@ -59,6 +59,7 @@ mod error;
 mod follow;
 mod index;
 mod resample;
+mod sampling;
 mod thumbnails;
 mod tiles;
 
@@ -124,6 +125,9 @@ pub struct StitchedOptions {
     pub disk_cache: Option<DiskCache>,
     /// How long chunks fail that show a tile which cannot be read, until it is tried again.
     pub try_again: Duration,
+    /// How long a pyramid that is not there counts as one on its way: some stores show a file later than
+    /// the catalog names it. After that it counts as lost, though it is still looked for.
+    pub may_come_for: Duration,
 }
 
 impl Default for StitchedOptions {
@@ -141,6 +145,7 @@ impl Default for StitchedOptions {
             gaps: Gaps::Empty,
             disk_cache: None,
             try_again: Duration::from_secs(3),
+            may_come_for: Duration::from_mins(1),
             builds: std::thread::available_parallelism().map_or(2, usize::from),
         }
     }

@@ -1,7 +1,7 @@
 //! Builds the sections of a block.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -21,13 +21,12 @@ use super::coverage::{Candidate, Grid, Overlaps, Segment, Uncovered};
 use super::error::StitchError;
 use super::index::IndexedTile;
 use super::resample::{Interpolation, Sample};
+use super::sampling::{Layer, Layers, halvings};
 use super::tiles::{Image, Tiles};
 use super::{StitchedOptions, StitchedStatistics};
 use crate::ValueRange;
 use crate::processors::on_a_processor;
 
-/// Samples per axis that a voxel larger than any pixel is made of, at most: 2^4.
-const FINEST_SAMPLING: u32 = 4;
 /// Sections of a block on which work is under way.
 const SECTIONS_AT_ONCE: usize = 4;
 /// Tiles of a section whose values are looked up for the bounds of a box, at most.
@@ -193,7 +192,7 @@ impl Builder {
     pub(super) fn description(&self, place: Place, plan: &Plan) -> String {
         let (volume, rules) = (&self.volume, self.rules);
         let (sections, near) = (&plan.sections, &plan.near);
-        format!("block 1 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
+        format!("block 2 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
     }
 
     /// Builds a block, as planned if it was.
@@ -279,20 +278,47 @@ impl Builder {
         sections: &[u32],
     ) -> Result<Option<(u16, u16)>, StitchError> {
         let whole = Grid::of_level(self.level(place), place.voxels);
-        let (min, max) = whole.bounds();
-        let mut planned: Option<Grid> = None;
-        let mut range = None;
+        // Which voxels are sampled how finely is not asked: each kind is taken for all.
+        let (mut needed, mut done) = (BTreeSet::new(), BTreeSet::new());
         for &section in sections {
-            let near = self.near(section, place.channel, (min, max), None).await?;
+            let near = self.near(section, place.channel, whole.bounds(), None);
+            needed.extend(near.await?.iter().map(|tile| halvings(tile, whole.step)));
+            if !needed.is_empty() {
+                break;
+            }
+        }
+        let mut range = None;
+        while let Some(&next) = needed.difference(&done).next() {
+            let grid = whole.finer(1 << next);
+            let (seen, also) = self.range_on(place, sections, (whole, grid)).await?;
+            range = range.into_iter().chain(seen).reduce(union);
+            needed.extend(also);
+            done.insert(next);
+        }
+        Ok(range)
+    }
+
+    /// The same of voxels that are sampled alike, on a grid; and how finely the tiles that it looked at
+    /// need them to be.
+    async fn range_on(
+        &self,
+        place: Place,
+        sections: &[u32],
+        (whole, grid): (Grid, Grid),
+    ) -> Result<(Option<(u16, u16)>, BTreeSet<u32>), StitchError> {
+        let mut range = None;
+        let mut needed = BTreeSet::new();
+        for &section in sections {
+            let near = self.near(section, place.channel, whole.bounds(), None);
+            let near = near.await?;
             if near.is_empty() {
                 continue;
             }
-            let grid =
-                *planned.get_or_insert_with(|| whole.finer(1 << sampling(&near, whole.step)));
             // To open so many costs more than it saves to know what they show.
             if near.len() > MOST_BOUNDS {
-                return Ok(Some((1, u16::MAX)));
+                return Ok((Some((1, u16::MAX)), needed));
             }
+            needed.extend(near.iter().map(|tile| halvings(tile, whole.step)));
             let opened = near.into_iter().map(async |tile| {
                 let level = grid.level_of(&tile);
                 let image = self.tiles.bounds(&tile, level).await?;
@@ -318,7 +344,7 @@ impl Builder {
                 break;
             }
         }
-        Ok(range)
+        Ok((range, needed))
     }
 
     /// The tiles of a section whose bounds touch a rectangle \[level-0 voxels\].
@@ -401,68 +427,77 @@ impl Builder {
     ) -> Result<Slice<S>, StitchError> {
         let (voxels, level, rules) = (place.voxels, self.level(place), self.rules);
         let size = voxels.size().truncate();
-        let mut planned: Option<(Grid, Uncovered)> = None;
         let mut parts = Vec::new();
         let mut failures = Vec::new();
         let whole = Grid::of_level(level, voxels);
-        let (min, max) = whole.bounds();
+        let mut layers = Layers::new(whole);
         for section in sections {
-            let mut near = self.near(section, place.channel, (min, max), plan).await?;
+            let near = self.near(section, place.channel, whole.bounds(), plan);
+            let near = near.await?;
             if near.is_empty() {
                 continue;
             }
-            let (grid, uncovered) = match planned.take() {
-                None => {
-                    let grid = whole.finer(1 << sampling(&near, whole.step));
-                    (grid, Uncovered::all(&grid))
-                }
+            let looked_at = on_a_processor(move || {
+                layers.look_at(&near);
+                (layers, near)
+            });
+            let near;
+            (layers, near) = looked_at.await;
+            for halvings in layers.halvings() {
+                let Some(layer) = layers.take(halvings) else {
+                    continue;
+                };
+                let near = near.clone();
+                let (grid, by) = (layer.grid, layer.by);
                 // Coarse levels span many sections, of which the first hides nearly all: only what
                 // may still be seen is opened.
-                Some((grid, uncovered)) => {
-                    let seen = on_a_processor(move || {
-                        near.retain(|tile| uncovered.touches(&grid, tile));
-                        (near, uncovered)
-                    });
-                    let uncovered;
-                    (near, uncovered) = seen.await;
-                    (grid, uncovered)
-                }
-            };
-            let opened = near.iter().map(|tile| {
-                let of_pyramid = grid.level_of(tile);
-                let image = self.tiles.image(tile, of_pyramid);
-                image.map(move |image| (of_pyramid, image))
-            });
-            let opened = join_all(opened).await;
-            let mut candidates = Vec::new();
-            for (tile, (of_pyramid, image)) in near.into_iter().zip(opened) {
-                match image {
-                    Ok(image) => {
-                        candidates.push(Candidate::new(tile, image, of_pyramid, rules.labels));
-                    }
-                    Err(error) => {
-                        self.tiles.damaged().note(&tile, &error);
-                        failures.push(Failure::bounds(error, &tile, level, voxels));
+                let seen = on_a_processor(move || {
+                    let touches = |tile: &Arc<_>| layer.uncovered.touches(&grid, tile);
+                    (near.into_iter().filter(touches).collect(), layer.uncovered)
+                });
+                let (near, uncovered): (Vec<_>, Uncovered) = seen.await;
+                let opened = near.iter().map(|tile| {
+                    let of_pyramid = grid.level_of(tile);
+                    let image = self.tiles.image(tile, of_pyramid);
+                    image.map(move |image| (of_pyramid, image))
+                });
+                let opened = join_all(opened).await;
+                let mut candidates = Vec::new();
+                for (tile, (of_pyramid, image)) in near.into_iter().zip(opened) {
+                    match image {
+                        Ok(image) => {
+                            candidates.push(Candidate::new(tile, image, of_pyramid, rules.labels));
+                        }
+                        Err(error) => {
+                            let error = self.tiles.damaged().note(&tile, error);
+                            failures.push(Failure::bounds(error, &tile, level, voxels));
+                        }
                     }
                 }
+                let covered =
+                    on_a_processor(move || cover(&grid, rules.overlaps, uncovered, candidates));
+                let (uncovered, new_parts) = covered.await;
+                parts.extend(new_parts.into_iter().map(|part| (grid, part)));
+                layers.put(
+                    halvings,
+                    Layer {
+                        grid,
+                        by,
+                        uncovered,
+                    },
+                );
             }
-            let covered =
-                on_a_processor(move || cover(&grid, rules.overlaps, uncovered, candidates));
-            let (uncovered, new_parts) = covered.await;
-            parts.extend(new_parts);
-            let done = uncovered.is_empty();
-            planned = Some((grid, uncovered));
-            if done {
+            if layers.all_covered() {
                 break;
             }
         }
-        let Some((grid, _)) = planned.filter(|_| !parts.is_empty()) else {
+        if parts.is_empty() {
             return Ok(Slice {
                 values: None,
                 failures,
             });
-        };
-        let fetched = parts.into_iter().map(async |part: Part| {
+        }
+        let fetched = parts.into_iter().map(async |(grid, part): (Grid, Part)| {
             let (candidate, interpolation) = (&part.candidate, rules.interpolation);
             let wanted = candidate.sub_tiles(&grid, &part.segments, interpolation);
             let fetched = match &candidate.image {
@@ -472,43 +507,40 @@ impl Builder {
                     { self.tiles.fetch(pyramid, section, candidate.level, wanted) }.await
                 }
             };
-            (part, fetched)
+            (grid, part, fetched)
         });
         let fetched = join_all(fetched).await;
         let tiles = self.tiles.clone();
         let sampled = on_a_processor(move || {
-            let by = grid.size.x / size.x;
-            let mut canvas = Canvas::<S>::new(grid, by, rules);
-            for (part, fetched) in fetched {
+            let mut canvases: BTreeMap<u32, Canvas<S>> = BTreeMap::new();
+            for (grid, part, fetched) in fetched {
+                let by = grid.size.x / size.x;
+                let canvas = canvases.entry(by);
+                let canvas = canvas.or_insert_with(|| Canvas::new(grid, by, rules));
                 let drawn = fetched.and_then(|fetched| canvas.draw(&tiles, &part, fetched));
                 let tile = &part.candidate.tile;
                 match drawn {
                     Ok(()) => tiles.damaged().clear(tile),
                     Err(error) => {
-                        tiles.damaged().note(tile, &error);
+                        let error = tiles.damaged().note(tile, error);
                         failures.push(Failure::segments(error, &part.segments, by));
                     }
                 }
             }
-            Slice {
-                values: Some(canvas.finish()),
-                failures,
-            }
+            // Each has values where the others have none.
+            let finished = canvases.into_values().map(Canvas::finish);
+            let values = finished.reduce(|mut values, others| {
+                for (value, other) in values.iter_mut().zip(others) {
+                    if *value == S::default() {
+                        *value = other;
+                    }
+                }
+                values
+            });
+            Slice { values, failures }
         });
         Ok(sampled.await)
     }
-}
-
-/// How many times the voxels of `step` level-0 voxels must be halved to be like a pixel of the
-/// coarsest level of every tile.
-fn sampling(tiles: &[Arc<IndexedTile>], step: DVec2) -> u32 {
-    let each = tiles.iter().map(|tile| {
-        let coarser = tile
-            .wanted_level(step)
-            .saturating_sub(tile.coarsest_level());
-        coarser.min(FINEST_SAMPLING)
-    });
-    each.max().unwrap_or(0)
 }
 
 /// Bounds of both.

@@ -291,18 +291,56 @@ impl Uncovered {
         }
     }
 
+    pub(super) fn none(grid: &Grid) -> Self {
+        Self {
+            rows: vec![Vec::new(); grid.size.y as usize],
+        }
+    }
+
+    /// The rows of samples of a row of voxels of `by` x `by` samples, and where its samples begin and end.
+    fn rows_of(
+        &mut self,
+        by: u32,
+        row: u32,
+        voxels: Range<u32>,
+    ) -> (&mut [Vec<Range<u32>>], Range<u32>) {
+        let rows = (row * by) as usize..((row + 1) * by) as usize;
+        (&mut self.rows[rows], voxels.start * by..voxels.end * by)
+    }
+
+    /// Adds some voxels of a row, of `by` x `by` samples each, none of which is there.
+    pub(super) fn add(&mut self, by: u32, row: u32, voxels: Range<u32>) {
+        let (rows, samples) = self.rows_of(by, row, voxels);
+        for left in rows {
+            left.push(samples.clone());
+        }
+    }
+
+    /// Takes away some voxels of a row, of `by` x `by` samples each.
+    pub(super) fn remove(&mut self, by: u32, row: u32, voxels: Range<u32>) {
+        let (rows, samples) = self.rows_of(by, row, voxels);
+        for left in rows {
+            take(left, samples.clone(), |_| {});
+        }
+    }
+
     pub(super) fn is_empty(&self) -> bool {
         self.rows.iter().all(Vec::is_empty)
     }
 
     /// Whether a tile's rectangle holds a sample that is left.
     pub(super) fn touches(&self, grid: &Grid, tile: &IndexedTile) -> bool {
-        (0..).zip(&self.rows).any(|(y, left)| {
-            let height = grid.point(0, y).y;
-            let row = || row_within(tile, grid, y);
-            let overlaps =
-                |row: Range<u32>| left.iter().any(|l| l.start < row.end && row.start < l.end);
-            !left.is_empty() && tile.min.y <= height && height <= tile.max.y && overlaps(row())
+        let row_at = |y: f64| (y / grid.step.y - f64::from(grid.first.y)).max(0.0);
+        // A row more on either side, since these are rounded.
+        let low = DVec2::splat(row_at(tile.min.y).floor() - 1.0).as_uvec2().x;
+        let high = DVec2::splat(row_at(tile.max.y).ceil() + 1.0).as_uvec2().x;
+        (low..high.min(grid.size.y)).any(|y| {
+            let (left, height) = (&self.rows[y as usize], grid.point(0, y).y);
+            if left.is_empty() || height < tile.min.y || tile.max.y < height {
+                return false;
+            }
+            let row = row_within(tile, grid, y);
+            !row.is_empty() && left.iter().any(|l| l.start < row.end && row.start < l.end)
         })
     }
 

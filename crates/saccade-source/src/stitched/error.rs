@@ -21,6 +21,17 @@ pub enum StitchError {
         /// Where the tile is seen.
         section: u32,
     },
+    /// A tile's pyramid is not there, and has not come for a while.
+    #[error(
+        "the pyramid of a tile of section {section} is missing; `saccade check ARCHIVE --repair` has it made \
+         anew: {name}"
+    )]
+    Missing {
+        /// Where the tile is seen.
+        section: u32,
+        /// The file.
+        name: String,
+    },
     /// A tile's pyramid is not of the size that the catalog says.
     #[error(
         "the pyramid is of {got} pixels, the catalog says {expected}; append the tile's \
@@ -89,11 +100,27 @@ impl StitchError {
                 other => format!("{self}: {}: {name}", other.without_place()),
             },
             Self::Tile { source, .. } => format!("{self}: {source}"),
-            Self::Size { .. }
+            Self::Missing { .. }
+            | Self::Size { .. }
             | Self::Dtype { .. }
             | Self::Mistaken { .. }
             | Self::Cut { .. }
             | Self::Stopped { .. } => self.to_string(),
+        }
+    }
+
+    /// The pyramid that is not there, if that is what is wrong.
+    pub(super) fn missing(&self) -> Option<&str> {
+        match self {
+            Self::Tile {
+                source:
+                    PyramidError::Storage {
+                        source: StorageError::NotFound { .. },
+                        name,
+                    },
+                ..
+            } => Some(name),
+            _ => None,
         }
     }
 
@@ -104,8 +131,9 @@ impl StitchError {
             Self::Tile {
                 source: PyramidError::Storage { source, .. },
                 ..
-            } => !source.is_outage(),
+            } => !source.is_outage() && !source.is_shortage(),
             Self::Tile { .. }
+            | Self::Missing { .. }
             | Self::Size { .. }
             | Self::Dtype { .. }
             | Self::Mistaken { .. }
@@ -120,7 +148,8 @@ impl StitchError {
             Self::Catalog { source } => source.is_transient(),
             // A file that is not there may be on its way; the catalog named it.
             Self::Tile { source, .. } => matches!(source, PyramidError::Storage { .. }),
-            Self::Size { .. }
+            Self::Missing { .. }
+            | Self::Size { .. }
             | Self::Dtype { .. }
             | Self::Mistaken { .. }
             | Self::Cut { .. }

@@ -255,7 +255,7 @@ impl Tiles {
             from_disk: AtomicU64::new(0),
             next_serial: AtomicU64::new(0),
             decoded: AtomicU64::new(0),
-            damaged: DamagedTiles::default(),
+            damaged: DamagedTiles::new(options.may_come_for),
         }
     }
 

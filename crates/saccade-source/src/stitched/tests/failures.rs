@@ -179,6 +179,41 @@ fn a_tile_that_could_not_be_read_is_tried_again() {
     });
 }
 
+/// It may be on its way; then it is lost, as who asks is told; and if it comes after all, it is seen.
+#[test]
+fn a_pyramid_that_does_not_come_is_lost() {
+    run(async {
+        let (fixture, left) = two().await;
+        let whole = fixture.storage.read(&left, None).await.unwrap();
+        fixture.storage.delete(&left).await.unwrap();
+        let options = StitchedOptions {
+            try_again: Duration::from_millis(10),
+            may_come_for: Duration::from_millis(300),
+            ..StitchedOptions::default()
+        };
+        let source = fixture.open_with(options).await;
+        let begin = std::time::Instant::now();
+        let lost = loop {
+            let error = source.read(id(0)).await.unwrap_err();
+            let late = begin.elapsed() >= Duration::from_millis(300);
+            assert!(error.is_transient() || late, "{}", text(&error));
+            if !error.is_transient() {
+                break text(&error);
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        };
+        assert!(
+            lost.contains("missing") && lost.contains("--repair"),
+            "{lost}"
+        );
+        fixture.storage.write_durable(&left, whole).await.unwrap();
+        while source.read(id(0)).await.is_err() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert_eq!(source.damage(), []);
+    });
+}
+
 #[test]
 fn pyramids_of_other_types_are_refused() {
     run(async {

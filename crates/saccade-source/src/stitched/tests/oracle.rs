@@ -179,27 +179,38 @@ pub(super) fn stitch(
             .round()
     };
     // Voxels larger than pixels of the coarsest level are means of several samples.
-    let finer = tiles.values().map(|t| wanted(t) - t.coarsest() as f64);
-    let finer = finer.fold(0.0, f64::max).min(4.0);
-    let by = 2_f64.powf(finer);
-    let level_of = |t: &RawTile| {
+    let finer = |t: &RawTile| (wanted(t) - t.coarsest() as f64).clamp(0.0, 4.0);
+    let level_of = |t: &RawTile, by: f64| {
         let wanted = (t.pixels_per_voxel() * (down[0] * down[1]).sqrt() / by).log2();
         wanted.round().clamp(0.0, t.coarsest() as f64) as usize
     };
-    let levels: BTreeMap<_, _> = tiles
+    let levels: BTreeMap<_, Vec<Level>> = tiles
         .iter()
-        .map(|(id, t)| (**id, t.level(level_of(t))))
+        .map(|(id, t)| (**id, (0..=t.coarsest()).map(|k| t.level(k)).collect()))
         .collect();
-    let (step_x, step_y) = (down[0] / by, down[1] / by);
+    // Whether a tile's bounds touch a voxel.
+    let touches = |t: &RawTile, x: u32, y: u32| {
+        let [a, b, c, d, tx, ty] = t.transform;
+        let (w, h) = (t.width as f64, t.height as f64);
+        let spread = |from: f64, along: f64, across: f64, voxel: u32, down: f64| {
+            let (low, high) = (
+                along.min(0.0) + across.min(0.0),
+                along.max(0.0) + across.max(0.0),
+            );
+            let (low, high) = ((from + low) / down, (from + high) / down);
+            low < f64::from(voxel) + 1.0 && high > f64::from(voxel)
+        };
+        spread(tx, a * w, c * h, x, down[0]) && spread(ty, b * w, d * h, y, down[1])
+    };
 
     let of_section = |section| tiles.iter().filter(move |(_, t)| t.section == section);
-    let sample = |near: &[(&&i64, &&RawTile)], x: f64, y: f64| {
+    let sample = |near: &[(&&i64, &&RawTile)], by: f64, x: f64, y: f64| {
         let mut there = Vec::new();
         for (id, tile) in near {
             let (u, v) = tile.pixel(x, y);
             let (w, h) = (tile.width as f64, tile.height as f64);
             let inside = u >= 0.0 && v >= 0.0 && u < w && v < h;
-            let level = &levels[**id];
+            let level = &levels[**id][level_of(tile, by)];
             if !inside || level.is_blank(u / level.f, v / level.f) {
                 continue;
             }
@@ -243,12 +254,19 @@ pub(super) fn stitch(
             sections.iter().map(|s| of_section(*s).collect()).collect()
         };
         let voxel = |sections: &[Vec<(&&i64, &&RawTile)>], x: u32, y: u32| -> f64 {
+            // As finely as a tile needs that is there in the first section that has any.
+            let there = |near: &Vec<(&&i64, &&RawTile)>| {
+                let there = near.iter().filter(|(_, t)| touches(t, x, y));
+                there.map(|(_, t)| finer(t)).reduce(f64::max)
+            };
+            let by = 2_f64.powf(sections.iter().find_map(there).unwrap_or(0.0));
+            let (step_x, step_y) = (down[0] / by, down[1] / by);
             let (mut sum, mut count) = (0.0, 0.0);
             for j in 0..by as u32 {
                 for i in 0..by as u32 {
                     let px = (f64::from(x) * by + f64::from(i) + 0.5) * step_x;
                     let py = (f64::from(y) * by + f64::from(j) + 0.5) * step_y;
-                    let seen = sections.iter().find_map(|near| sample(near, px, py));
+                    let seen = sections.iter().find_map(|near| sample(near, by, px, py));
                     sum += seen.unwrap_or(0.0);
                     count += if seen.is_some() { 1.0 } else { 0.0 };
                 }
