@@ -451,21 +451,27 @@ impl<F: Folders> Watch<F> {
 ///
 /// # Errors
 ///
-/// [`WatchError`]: but a folder that cannot be listed for a while is tried again, and a full disk is waited out.
+/// [`WatchError`]: but a folder that cannot be listed is tried again, some times with `once` and else for as long as
+/// it takes, and a full disk is waited out.
 pub fn run<F: Folders>(
     watch: &mut Watch<F>,
     once: bool,
     cancel: &Cancel,
 ) -> Result<u64, WatchError> {
-    /// Looks at a disk that stays full, after which it is said again.
+    /// Looks at a disk that stays full, or a folder that stays away, after which it is said again.
     const SAY_AGAIN: u32 = 40;
+    /// Looks at a folder that cannot be listed, for those who wait for the end.
+    const LOOKS_ONCE: u32 = 10;
     let mut told = 0;
-    let mut failures = 0;
+    let mut failures: u32 = 0;
     let mut full: u32 = 0;
     let mut warned = false;
     while !cancel.is_cancelled() {
         match watch.look() {
             Ok((new, next)) => {
+                if failures > 0 {
+                    log::warn!("the folder can be looked into again");
+                }
                 (failures, full) = (0, 0);
                 told += new;
                 // Who looks once is told by the caller.
@@ -479,14 +485,14 @@ pub fn run<F: Folders>(
                     Next::Again | Next::Rest => {}
                 }
             }
-            Err(WatchError::Look { source, path }) if failures < 10 => {
-                if failures == 0 {
+            Err(WatchError::Look { source, path }) if !once || failures < LOOKS_ONCE => {
+                if failures.is_multiple_of(SAY_AGAIN) {
                     log::warn!(
                         "cannot look into {}, trying again: {source}",
                         path.display()
                     );
                 }
-                failures += 1;
+                failures = failures.saturating_add(1);
             }
             Err(e) if e.is_full() => {
                 if full.is_multiple_of(SAY_AGAIN) {

@@ -53,10 +53,10 @@ pub(super) async fn patiently<T>(
                 tokio::time::sleep(options.poll).await;
             }
             Err(e) => {
-                // Who waits for the end is told, rather than kept.
-                let patient = !options.once || backoff.failures < ATTEMPTS_ONCE;
-                let passing = patient && matches!(e, AcquisitionError::Read { .. });
-                if !backoff.may_go_on(false, passing) {
+                // Who waits for the end is told, rather than kept; a stream waits for its share.
+                let away = matches!(e, AcquisitionError::Read { .. });
+                let passing = away && backoff.failures < ATTEMPTS_ONCE;
+                if !backoff.may_go_on(away && !options.once, passing) {
                     return Err(e.into());
                 }
                 backoff.say_and_wait(progress, &e).await;

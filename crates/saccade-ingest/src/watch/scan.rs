@@ -332,7 +332,15 @@ impl<F: Folders> Scanner<F> {
                     });
                 }
                 Ok((_, None)) => {}
-                Err(e) if whole => return Err(e),
+                Err(e) if whole => {
+                    // It is asked first by the next look, and what was found is told before.
+                    self.round.rotate_right(1);
+                    self.to_ask += 1;
+                    return match found.is_empty() {
+                        true => Err(e),
+                        false => Ok((found, Next::Again)),
+                    };
+                }
                 Err(e) => {
                     // Once for each reason.
                     if self.closed.insert(folder, e.kind()) != Some(e.kind()) {

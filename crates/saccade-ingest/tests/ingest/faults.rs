@@ -267,3 +267,45 @@ async fn after_a_crash_at_any_write_nothing_is_lost() {
         }
     }
 }
+
+/// As where the microscope's share is gone for a while: it takes longer than some attempts.
+#[tokio::test]
+async fn an_acquisition_that_is_away_is_waited_for() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    scope.tile("t0", 0, SIZE, 0);
+    let away = folder.path().join("away");
+    let options = IngestOptions {
+        once: false,
+        ..quick()
+    };
+    let (diary, cancel) = (Diary::default(), Cancel::new());
+    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
+    let entered = async |tiles: u64| {
+        while archive
+            .catalog()
+            .entry(VOLUME)
+            .await
+            .map_or(0, |entry| entry.tiles)
+            < tiles
+        {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    let other = async {
+        entered(1).await;
+        fs::rename(scope.path(), &away).unwrap();
+        // Far longer than pauses between attempts.
+        tokio::time::sleep(options.retry * 500).await;
+        let why = diary.held_up().expect("it says why it waits");
+        assert!(why.contains("cannot read"), "{why}");
+        fs::rename(&away, scope.path()).unwrap();
+        scope.tile("t1", 1, SIZE, 1);
+        entered(2).await;
+        cancel.cancel();
+    };
+    let both = async { tokio::join!(ingest, other) };
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+    assert_eq!(both.expect("it goes on").0.unwrap().tiles, 2);
+    assert_eq!(diary.held_up(), None);
+}
