@@ -14,6 +14,7 @@ mod folders;
 mod interrupt;
 mod looks;
 mod open;
+mod open_files;
 mod progress;
 mod report;
 mod stitching;
@@ -48,6 +49,7 @@ fn main() -> ExitCode {
     let CommandLine { command } = CommandLine::parse();
     report::log_to_stderr();
     saccade_archive::tls::provide();
+    open_files::raise();
     let runtime = match tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()

@@ -4,6 +4,7 @@
 
 mod demo;
 mod errors;
+mod failed_sync;
 mod images;
 mod labels;
 mod lists;
