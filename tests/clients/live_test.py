@@ -68,6 +68,67 @@ class Live(unittest.TestCase):
         self.assertGreater(turned_differs, compared / 4, "the comparison cannot tell axes apart")
         print(f"\n{compared} positions on {self.levels} levels, {measured} of them acquired, {len(clients)} clients")
 
+    @unittest.skipUnless(os.environ.get("SACCADE_CHROMIUM"), "no browser is named")
+    def test_1_neuroglancer_shows_them_while_they_arrive(self):
+        from lib.page import Page
+
+        page = Page(os.environ["SACCADE_CHROMIUM"], self.reference.volume["voxel_nm"])
+        self.addCleanup(page.close)
+        begun, levels_shown = self.acquisition.revision(), set()
+        for level in range(self.levels):
+            for plane in ["xy", "xz", "yz"]:
+                shown = self.plane_compared(page, level, plane)
+                if plane == "xy":
+                    self.assertEqual(shown, level)
+                levels_shown.add((plane, shown))
+        self.assertGreater(self.acquisition.revision(), begun, "nothing came meanwhile")
+        self.assertTrue(self.acquisition.microscope.running(), "the acquisition ended before the comparison did")
+        print(f"\nplanes and levels shown: {sorted(levels_shown)}")
+
+    def plane_compared(self, page, level, plane):
+        """Compares a plane at a random place that holds still meanwhile, as coarse as a level; returns the level that
+        was shown."""
+        downs = [np.array(level["downsampling"]) for level in self.reference.volume["levels"]]
+        edges = np.array(self.reference.volume["voxel_nm"]) / min(self.reference.volume["voxel_nm"])
+        # Neuroglancer turns the plane of y and z about y: z grows to the left.
+        right, down, sign = {"xy": (0, 1, 1), "xz": (0, 2, 1), "yz": (2, 1, -1)}[plane]
+        width, height = size = [56, 40]
+        scale = downs[level][0]
+        for _ in range(60):
+            middle = random.uniform(0, self.reference.extents[0])
+            points = np.tile(middle, (height, width, 1))
+            points[..., right] += sign * (np.arange(width) + 0.5 - width / 2) * scale / edges[right]
+            points[..., down] += ((np.arange(height) + 0.5 - height / 2) * scale / edges[down])[:, None]
+            points = points.reshape(-1, 3)
+            # Not where rounding decides which voxel it is.
+            parts = [points / by - np.floor(points / by) for by in downs]
+            if any(part.min() < 0.01 or part.max() > 0.99 for part in parts):
+                continue
+            before = [self.shown(k, points / by) for k, by in enumerate(downs)]
+            wants = [want.reshape(height, width) for _, want in before]
+            others = [want for k, want in enumerate(wants) if k != level]
+            if (wants[level] != 0).mean() < 0.2 or any((wants[level] == other).mean() > 0.95 for other in others):
+                continue
+            version = self.acquisition.json(f"v/{Acquisition.NAME}/volume.json")["version"]
+            source = f"{self.url}/at/{version}/zarr/|zarr3:"
+            # In OME-Zarr the origin is the middle of voxel 0.
+            got = page.section(source, list(middle - 0.5), size, scale, plane)
+            after = [self.shown(k, points / by)[0] for k, by in enumerate(downs)]
+            if any((was[0] != now).any() for was, now in zip(before, after)):
+                continue
+            same = [k for k, want in enumerate(wants) if (want == got).all()]
+            self.assertEqual(len(same), 1, f"{plane} as coarse as level {level} around {middle}: it is that of levels {same}")
+            return same[0]
+        self.fail(f"{plane} as coarse as level {level}: no place holds still")
+
+    def shown(self, level, points):
+        """States and values at points [voxels of the level]; outside of the volume there is nothing."""
+        at = np.floor(points).astype(int)
+        inside = ((at >= 0) & (at < self.reference.extents[level])).all(1)
+        states, values = np.full(len(at), "outside", object), np.zeros(len(at), np.uint8)
+        states[inside], values[inside] = self.reference.chunks(level, at[inside])
+        return states, values
+
     def test_2_the_example_runs(self):
         example = Path(__file__).parents[2] / "examples" / "live_volume.py"
         run = subprocess.run([sys.executable, example, self.acquisition.url], capture_output=True, text=True, timeout=60)

@@ -32,14 +32,15 @@ class Page:
             [chromium, *FLAGS, f"--user-data-dir={self.profile.name}", self.viewer.get_viewer_url()],
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
-    def section(self, source, position, size, scale=1):
-        """Gray values [y, x] around a position [level-0 voxels], `scale` voxels to a pixel, complete."""
+    def section(self, source, position, size, scale=1, plane="xy"):
+        """Gray values [down, right] around a position [level-0 voxels], `scale` of the shortest edges of voxels to a
+        pixel, complete."""
         with self.viewer.txn() as state:
             state.dimensions = self.space
             state.layers.clear()
             state.layers["em"] = neuroglancer.ImageLayer(source=source, shader=SHADER)
             state.position = position
-            state.layout = "xy"
+            state.layout = plane
             state.cross_section_scale = scale
             state.cross_section_background_color = "#000000"
             state.show_axis_lines = False
