@@ -261,10 +261,14 @@ async fn migrate(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
             Err(MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _)) => {
                 return Err(newer_schema(found, path));
             }
-            Err(e @ (MigrateError::Execute(_) | MigrateError::ExecuteMigration(..)))
-                if attempts < 20 =>
-            {
-                log::debug!("another process is making the catalog: {e}");
+            Err(MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _)) => {
+                let error = failed(e);
+                // Nothing that was written before a failed sync is sure to be there.
+                let lasts = matches!(error, CatalogError::NotSynced { .. });
+                if lasts || attempts == 20 {
+                    return Err(error);
+                }
+                log::debug!("another process is making the catalog: {error}");
                 attempts += 1;
                 tokio::time::sleep(Duration::from_millis(50)).await;
             }

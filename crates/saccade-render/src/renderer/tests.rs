@@ -186,11 +186,12 @@ fn a_stand_in_draws_the_same_picture() {
     let stood_in = !gpu.ray_caster().is_ready(wanted(1));
     pollster::block_on(renderer.finish());
     let first = pollster::block_on(renderer.read_pixels()).unwrap();
-    let began = std::time::Instant::now();
+    let mut looks = 0;
     let next = wanted(1).likely_next(3);
     let ready = |variant: &Variant| gpu.ray_caster().is_ready(*variant);
     while !(ready(&wanted(1)) && next.iter().all(ready)) {
-        assert!(began.elapsed().as_secs() < 300, "it is never compiled");
+        looks += 1;
+        assert!(looks < 15_000, "it is never compiled");
         std::thread::sleep(std::time::Duration::from_millis(20));
     }
     let own = settle(&mut renderer);

@@ -105,7 +105,7 @@ impl Bare {
                         folder.display()
                     );
                 }
-                return Ok(Followed::Records);
+                Ok(Followed::Records)
             }
             Err(nothing @ AcquisitionError::NoInfo { .. }) => {
                 let before = kept.and_then(|kept| kept_list(folder, kept));
