@@ -77,8 +77,11 @@ fn pages_of_a_tiff_are_stacks() {
     conformance::check(&*open(folder.path()).unwrap(), EXTENT, &values());
 }
 
+/// Entries of a page's directory, and its pixels.
+type Page<'a> = (&'a [(u16, u32)], &'a [u8]);
+
 /// A TIFF of one directory per page, written by hand: each is its tags, as short numbers, and its data.
-fn pages_by_hand(pages: &[(&[(u16, u32)], &[u8])]) -> Vec<u8> {
+fn pages_by_hand(pages: &[Page<'_>]) -> Vec<u8> {
     let mut file = b"II\x2a\0\0\0\0\0".to_vec();
     let mut link = 4;
     for (tags, data) in pages {
@@ -183,7 +186,13 @@ fn pages_that_are_bombs_are_refused() {
         resident("VmHWM").saturating_sub(before)
     };
     if let Some(bomb) = std::env::var_os(BOMB) {
-        let control = took(&mut || drop(std::hint::black_box(vec![1_u8; 2 * CEILING as usize])));
+        let control = took(&mut || {
+            drop(std::hint::black_box(vec![
+                1_u8;
+                2 * usize::try_from(CEILING)
+                    .unwrap()
+            ]))
+        });
         assert!(control > CEILING, "the measure sees {control} bytes");
         let took = took(&mut || {
             let refused = match TiffPages::open(Path::new(&bomb)) {

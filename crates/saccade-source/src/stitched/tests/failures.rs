@@ -192,7 +192,7 @@ fn a_pyramid_that_does_not_come_is_lost() {
             ..StitchedOptions::default()
         };
         let source = fixture.open_with(options).await;
-        let begin = std::time::Instant::now();
+        let begin = tokio::time::Instant::now();
         let lost = loop {
             let error = source.read(id(0)).await.unwrap_err();
             let late = begin.elapsed() >= Duration::from_millis(300);
