@@ -64,7 +64,11 @@ fn the_volume_stops_and_goes_on_whole() {
                 "{place}, then {}",
                 stderr(&checked)
             );
-            done(["export", text, folder.path().join("image").to_str().unwrap()]);
+            done([
+                "export",
+                text,
+                folder.path().join("image").to_str().unwrap(),
+            ]);
             std::fs::remove_dir_all(folder.path().join("image")).unwrap();
             std::fs::remove_dir_all(archive).unwrap();
         }
