@@ -74,21 +74,17 @@ class Live(unittest.TestCase):
 
         page = Page(os.environ["SACCADE_CHROMIUM"], self.reference.volume["voxel_nm"])
         self.addCleanup(page.close)
-        levels_shown, revisions = set(), [self.acquisition.revision()]
+        revisions = [self.acquisition.revision()]
         for level in range(self.levels):
             for plane in ["xy", "xz", "yz"]:
                 until("tiles arrive", lambda: self.acquisition.revision() > revisions[-1])
                 with self.acquisition.held():
-                    shown = self.plane_compared(page, level, plane)
+                    self.plane_compared(page, level, plane)
                 revisions.append(self.acquisition.revision())
-                if plane == "xy":
-                    self.assertEqual(shown, level)
-                levels_shown.add((plane, shown))
         self.assertTrue(self.acquisition.microscope.running(), "the acquisition ended before the comparison did")
-        print(f"\nplanes and levels shown: {sorted(levels_shown)}")
 
     def plane_compared(self, page, level, plane):
-        """Compares a plane at a random place, as coarse as a level; returns the level that was shown."""
+        """Compares a plane at a random place, as coarse as a level."""
         downs = [np.array(level["downsampling"]) for level in self.reference.volume["levels"]]
         edges = np.array(self.reference.volume["voxel_nm"]) / min(self.reference.volume["voxel_nm"])
         # Neuroglancer turns the plane of y and z about y: z grows to the left.
@@ -101,28 +97,33 @@ class Live(unittest.TestCase):
             points[..., right] += sign * (np.arange(width) + 0.5 - width / 2) * scale / edges[right]
             points[..., down] += ((np.arange(height) + 0.5 - height / 2) * scale / edges[down])[:, None]
             points = points.reshape(-1, 3)
-            # Not where rounding decides which voxel it is.
-            parts = [points / by - np.floor(points / by) for by in downs]
-            if any(part.min() < 0.01 or part.max() > 0.99 for part in parts):
+            # Not where a fifth of a pixel decides which voxel it is.
+            part = np.abs(points / downs[level] - np.round(points / downs[level]))
+            clear = (part >= np.minimum(0.2 * scale / edges / downs[level], 0.4)).all(1).reshape(height, width)
+            if clear.mean() < 0.2:
                 continue
             # Coarse voxels may reach beyond the volume, and are shown there.
             inside = ((points >= 0) & (points < self.reference.extents[0])).all(1).reshape(height, width)
             before = [self.shown(k, points / by) for k, by in enumerate(downs)]
             wants = [want.reshape(height, width) * inside for _, want in before]
             others = [want for k, want in enumerate(wants) if k != level]
-            measured = (wants[level] != 0).sum()
-            if measured < 60 or any((wants[level] != other).sum() < measured / 4 for other in others):
+            measured = (wants[level] != 0)[clear].sum()
+            if measured < 30 or any((wants[level] != other)[clear].sum() < measured / 4 for other in others):
                 continue
             version = self.acquisition.json(f"v/{Acquisition.NAME}/volume.json")["version"]
             source = f"{self.url}/at/{version}/zarr/|zarr3:"
             # In OME-Zarr the origin is the middle of voxel 0.
-            got = page.section(source, list(middle - 0.5), size, scale, plane) * inside
+            # On a busy machine a picture may be taken before the new layer is in it: what is wrong stays wrong.
+            for _ in range(8):
+                got = page.section(source, list(middle - 0.5), size, scale, plane) * inside
+                if (wants[level] == got)[clear].all():
+                    break
             after = [self.shown(k, points / by)[0] for k, by in enumerate(downs)]
             if any((was[0] != now).any() for was, now in zip(before, after)):
                 continue
-            same = [k for k, want in enumerate(wants) if (want == got).all()]
-            self.assertEqual(len(same), 1, f"{plane} as coarse as level {level} around {middle}: it is that of levels {same}")
-            return same[0]
+            place = f"{plane} as coarse as level {level} around {middle}"
+            np.testing.assert_array_equal(got[clear], wants[level][clear], place)
+            return
         self.fail(f"{plane} as coarse as level {level}: no place has tiles and holds still")
 
     def shown(self, level, points):
