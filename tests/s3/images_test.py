@@ -6,6 +6,7 @@ import sys
 import tempfile
 import unittest
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import tensorstore
@@ -115,6 +116,17 @@ class Images(unittest.TestCase):
             self.assertLess(np.abs(self.rendered(place, **SIGNED) - here).mean(), 0.5, name)
             self.assertGreater(np.abs(here - here[::-1]).mean(), 2, "the comparison shows nothing")
         self.assertEqual(set(self.proxy.answers), {(True, None)}, "every signature holds")
+
+    def test_names_are_as_they_are(self):
+        prefix = "Gewebe ä/50%20 #1+"
+        quoted = quote(prefix)
+        self.store.put_folder(self.work / self.images[0], BUCKET, quoted)
+        place = f"s3://{BUCKET}/{prefix}"
+        np.testing.assert_array_equal(self.exported(place, **SIGNED), voxels())
+        done = self.run_saccade("export", self.work / self.images[0], f"{place}/copy", **SIGNED)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        self.assertEqual(self.store.request("HEAD", f"/{BUCKET}/{quoted}/copy/zarr.json")[0], 200)
+        np.testing.assert_array_equal(self.exported(f"{place}/copy", **SIGNED), voxels())
 
     def test_anonymous(self):
         for name in self.images:

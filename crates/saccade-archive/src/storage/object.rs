@@ -147,7 +147,8 @@ impl ObjectStorage {
     pub fn of(store: Arc<dyn ObjectStore>, prefix: &str, location: String) -> Self {
         Self {
             store,
-            prefix: Path::from(prefix),
+            // As it is, so that others find it under the name it was given.
+            prefix: Path::parse(prefix).unwrap_or_else(|_| Path::from(prefix)),
             location: location.into(),
         }
     }

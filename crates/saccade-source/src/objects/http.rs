@@ -59,6 +59,8 @@ pub struct HttpObjects {
     heard: AtomicBool,
     /// Tags of objects that were read in parts.
     tags: Marks<String>,
+    /// Times and lengths, of those without a tag.
+    times: Marks<String>,
     requests: Semaphore,
     refusals: Refusals,
 }
@@ -92,6 +94,7 @@ impl HttpObjects {
             suffixes: platform::SUFFIXES,
             heard: AtomicBool::new(false),
             tags: Marks::default(),
+            times: Marks::default(),
             requests: Semaphore::new(REQUESTS),
             refusals: Refusals::default(),
         })
@@ -187,12 +190,20 @@ impl HttpObjects {
         }
     }
 
-    /// Whether a part is of the same object as the parts before, as far as tags tell.
+    /// Whether a part is of the same object as the parts before, as far as tags tell; without any, as far as its time
+    /// and length do.
     fn is_the_same(&self, key: &str, part: &Part, of: &HeaderMap) -> Result<(), Failure> {
-        let tag = of.get(header::ETAG).and_then(|tag| tag.to_str().ok());
-        let checked = self
-            .tags
-            .check(key, part, tag.and_then(strong), || self.location(key));
+        let text = |name| of.get(name).and_then(|value| value.to_str().ok());
+        let location = || self.location(key);
+        let checked = match text(header::ETAG).and_then(strong) {
+            Some(tag) => self.tags.check(key, part, Some(tag), location),
+            None => {
+                let length = text(header::CONTENT_RANGE).and_then(|range| range.rsplit('/').next());
+                let told = [text(header::LAST_MODIFIED), length].map(Option::unwrap_or_default);
+                let mark = (told != ["", ""]).then(|| told.join(" "));
+                self.times.check(key, part, mark, location)
+            }
+        };
         checked.map_err(Failure::Final)
     }
 

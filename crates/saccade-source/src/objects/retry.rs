@@ -1,5 +1,6 @@
 //! Asking again, a bounded number of times.
 
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use futures::future::{Either, select};
@@ -62,7 +63,10 @@ impl Patience {
                     location,
                 });
             }
-            log::debug!("attempt {attempts} failed: {reason}: {location}");
+            match is_to_be_told() {
+                true => log::warn!("trying again: {reason}: {location}"),
+                false => log::debug!("attempt {attempts} failed: {reason}: {location}"),
+            }
             // Readers that were refused together do not come back together.
             let spread = 1.0 + f64::from(scatter(key, attempts)) / f64::from(u32::MAX) / 2.0;
             let spread = wait.mul_f64(spread);
@@ -108,6 +112,20 @@ impl Pace {
             false => Ok(()),
         }
     }
+}
+
+/// Whether it is time to say that a store makes us wait: where one object does, many do.
+fn is_to_be_told() -> bool {
+    const TELL_AGAIN: Duration = Duration::from_secs(30);
+    static TOLD: Mutex<Option<Instant>> = Mutex::new(None);
+    let mut told = TOLD.lock().unwrap_or_else(PoisonError::into_inner);
+    let is_due = told.is_none_or(|told| told.elapsed() >= TELL_AGAIN);
+    if is_due {
+        #[expect(clippy::disallowed_methods, reason = "web_time's, which browsers have")]
+        let now = Instant::now();
+        *told = Some(now);
+    }
+    is_due
 }
 
 /// FNV-1a of a key and a number: the same everywhere, different for each.

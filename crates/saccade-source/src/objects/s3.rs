@@ -202,10 +202,12 @@ impl S3Objects {
     async fn attempt(&self, key: &str, part: &Part) -> Result<Found, Failure> {
         // The semaphore is never closed.
         let _permit = self.requests.acquire().await.ok();
-        let path: Path = match self.location.prefix() {
-            "" => Path::from(key),
-            prefix => Path::from(format!("{prefix}/{key}")),
+        let name = match self.location.prefix() {
+            "" => key.to_owned(),
+            prefix => format!("{prefix}/{key}"),
         };
+        // As it is: the client encodes it for the address, and stores keep names, not addresses.
+        let path = Path::parse(&name).unwrap_or_else(|_| Path::from(name));
         let options = GetOptions {
             range: match part {
                 Part::Whole { .. } => None,

@@ -37,6 +37,18 @@ async fn tags_tell(server: &TestServer, store: &dyn Objects, fresh: &dyn Objects
         tagged(nothing_told);
         assert!(ten(store).await.is_ok(), "{nothing_told:?}");
     }
+    // Where no tag tells of bytes, the time does.
+    let long = async || store.read("c/long", Part::Range(0..4)).await;
+    let times = [
+        "W/\"a\"\r\nlast-modified: Sun, 29 Nov 2026 10:00:00 GMT",
+        "W/\"a\"\r\nlast-modified: Sun, 29 Nov 2026 10:00:01 GMT",
+    ];
+    for (time, same) in [(times[0], true), (times[0], true), (times[1], false)] {
+        tagged(Some(time));
+        let read = long().await;
+        assert_eq!(read.is_ok(), same, "{read:?}");
+    }
+    tagged(None);
 }
 
 /// Nor is what lies in a folder another by itself.
