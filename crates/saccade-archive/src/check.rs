@@ -30,6 +30,9 @@ pub struct CheckOptions {
     pub repair: bool,
     /// The acquisition archive whose records say how to make damaged pyramids anew.
     pub acquisition: Option<PathBuf>,
+    /// The folder in which the records of bare folders and lists are kept, those of each volume in a folder of its
+    /// name: where there are some, they are what damaged pyramids are made anew of.
+    pub watched: Option<PathBuf>,
     /// Objects that nobody names may be about to be entered until they are so old.
     pub safe_age: Duration,
     /// Tiles in work at once. Each holds its pyramid in memory.
@@ -42,6 +45,7 @@ impl Default for CheckOptions {
             quick: false,
             repair: false,
             acquisition: None,
+            watched: None,
             safe_age: Duration::from_secs(3600),
             workers: 4,
         }
@@ -391,7 +395,7 @@ impl Check<'_> {
     ) -> Result<Repair, CheckError> {
         let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
         let read = self.archive.catalog().cursor(&entry.volume.name).await?;
-        let repair = match self.record(tile, read) {
+        let repair = match self.record(entry, tile, read) {
             Some((position, record)) => {
                 let reason = format!("its pyramid was found damaged: {reason}");
                 let waiting = Waiting {
@@ -423,8 +427,11 @@ impl Check<'_> {
 
     /// The record that a tile's pyramid was made of, if it and its image are still there, and the records are
     /// those that were `read`.
-    fn record(&self, tile: &Tile, read: Cursor) -> Option<(u64, TileRecord)> {
-        let folder = self.options.acquisition.as_ref()?;
+    fn record(&self, entry: &VolumeEntry, tile: &Tile, read: Cursor) -> Option<(u64, TileRecord)> {
+        let kept = { self.options.watched.iter() }.map(|all| all.join(&entry.volume.name));
+        let mut kept = kept.filter(|folder| folder.join(RecordReader::FILE).is_file());
+        let folder = kept.next().or_else(|| self.options.acquisition.clone())?;
+        let folder = folder.as_path();
         RecordReader::new(folder, read).recognize().ok()?;
         let offset = position_of(&tile.pyramid)?;
         let cursor = Cursor {

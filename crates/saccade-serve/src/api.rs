@@ -42,6 +42,9 @@ pub(crate) struct VolumeDescription {
     pub(crate) revision: u64,
     /// Names the state in addresses, `/v/NAME/at/VERSION/…`, for clients that never ask again.
     pub(crate) version: String,
+    /// What a user should know of how it is shown, in sentences: how values were mapped, for one.
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    pub(crate) notes: Vec<String>,
 }
 
 /// What a volume is.

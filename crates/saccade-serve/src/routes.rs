@@ -224,6 +224,7 @@ pub(crate) async fn volume(State(app): State<App>, Path(name): Path<String>) -> 
         volume: (&**published.volume()).into(),
         revision,
         version,
+        notes: published.source.notes().to_vec(),
     })
 }
 

@@ -11,7 +11,7 @@
 //! # Values
 //!
 //! As those of [`crate::zarr`]. A volume of type `segmentation` is one of labels: ids that fit into 16 bit stay what they
-//! are, others are scattered over 65535 numbers, which [`PrecomputedSource::notes`] tells: 0 stays nothing, the same id the
+//! are, others are scattered over 65535 numbers, which [`VolumeSource::notes`] tells: 0 stays nothing, the same id the
 //! same number everywhere.
 //!
 //! # Failure
@@ -111,16 +111,15 @@ impl PrecomputedSource {
             notes,
         })
     }
-
-    /// What a user should know of how the volume is shown, in sentences.
-    pub fn notes(&self) -> &[String] {
-        &self.notes
-    }
 }
 
 impl VolumeSource for PrecomputedSource {
     fn volume(&self) -> &Arc<Volume> {
         self.stored.volume()
+    }
+
+    fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {

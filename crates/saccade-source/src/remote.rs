@@ -149,6 +149,8 @@ pub struct RemoteSource {
     options: RemoteOptions,
     changes: Arc<Changes>,
     revisions: Arc<Revisions>,
+    /// What the server says of how the volume is shown.
+    notes: Vec<String>,
     /// What the server says of [`RENAMED_LABEL`]; 0 for nothing so far.
     renamed: AtomicU64,
     events: AbortHandle,
@@ -164,6 +166,8 @@ impl Drop for RemoteSource {
 struct VolumeJson {
     volume: Volume,
     revision: u64,
+    #[serde(default)]
+    notes: Vec<String>,
 }
 
 #[derive(Deserialize)]
@@ -213,7 +217,7 @@ impl RemoteSource {
     ) -> Result<Self, SourceError> {
         let client = client();
         let described = Self::describe(&client, base, name, options).await;
-        let (url, VolumeJson { volume, revision }) = match described {
+        let (url, described) = match described {
             Ok(described) => described,
             Err(RemoteError::Status { status, .. }) if status == StatusCode::NOT_FOUND => {
                 let known = volumes(base).await?;
@@ -222,6 +226,11 @@ impl RemoteSource {
             }
             Err(error) => return Err(open_error(error, base)),
         };
+        let VolumeJson {
+            volume,
+            revision,
+            notes,
+        } = described;
         let changes = Changes::new(VoxelBox::of_size(volume.extent()), revision);
         let revisions = Arc::new(Revisions::new(revision));
         let (events, registration) = AbortHandle::new_pair();
@@ -246,6 +255,7 @@ impl RemoteSource {
             options,
             changes,
             revisions,
+            notes,
             renamed: AtomicU64::new(0),
             events,
         })
@@ -316,6 +326,10 @@ impl VolumeSource for RemoteSource {
 
     fn revision(&self) -> u64 {
         self.changes.revision()
+    }
+
+    fn notes(&self) -> &[String] {
+        &self.notes
     }
 }
 

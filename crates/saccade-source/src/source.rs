@@ -223,6 +223,11 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
         Vec::new()
     }
 
+    /// What a user should know of how the volume is shown, in sentences: values that were mapped, for one.
+    fn notes(&self) -> &[String] {
+        &[]
+    }
+
     /// An id of labels among what was read so far that is another number in the volume, which other ids may share, since
     /// the volume's type is too narrow for it.
     fn renamed_label(&self) -> Option<u64> {

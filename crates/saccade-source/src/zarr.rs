@@ -6,18 +6,18 @@
 //!
 //! Of version 0.6 (RFC-5), an image is shown in the coordinate system in which its levels lie, where they are placed by scale,
 //! translation or identity, alone or in sequence. Transformations that lead from there to others are told in
-//! [`ZarrSource::notes`], not applied; scenes of several images are refused with their names.
+//! [`VolumeSource::notes`], not applied; scenes of several images are refused with their names.
 //!
 //! The finest level is where the volume is; how far it is moved as a whole is kept in
 //! [`Volume::origin_nm`](saccade_core::volume::Volume::origin_nm). Others lie where their transformations say: they may cover a part of it, or more. By up to
 //! half of its voxels a level may be off, since writers mean the middle or the corner of a voxel; what is further away is
-//! told in [`ZarrSource::notes`].
+//! told in [`VolumeSource::notes`].
 //!
 //! # Values
 //!
 //! Unsigned integers of 8 and 16 bit are what they are. Signed ones are moved up by half their range, so that
 //! their order stays. Wider numbers are shown in 16 bit: whole ones as they are if those of the coarsest
-//! level fit, others within a window that [`ZarrSource::notes`] tells. A value of 0 counts as nothing
+//! level fit, others within a window that [`VolumeSource::notes`] tells. A value of 0 counts as nothing
 //! measured, as everywhere.
 //!
 //! An image of whole numbers is a volume of labels where it says so (`image-label`), or lies in a folder `labels` and has no
@@ -158,16 +158,15 @@ impl ZarrSource {
             notes,
         })
     }
-
-    /// What a user should know of how the image is shown, in sentences.
-    pub fn notes(&self) -> &[String] {
-        &self.notes
-    }
 }
 
 impl VolumeSource for ZarrSource {
     fn volume(&self) -> &Arc<Volume> {
         self.stored.volume()
+    }
+
+    fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {

@@ -209,6 +209,9 @@ impl Place {
                     },
                 };
                 let source = RemoteSource::open(address, &name).await?;
+                for note in source.notes() {
+                    say(note);
+                }
                 let reader = source.status_reader();
                 let acquisition: AcquisitionReader = Arc::new(move || {
                     let reader = reader.clone();

@@ -372,6 +372,34 @@ async fn a_folder_in_the_place_of_a_pyramid_is_told_and_the_others_are_repaired(
     assert_eq!(waiting, ["t3", "t4"]);
 }
 
+/// A volume of a bare folder has its records beside the archive: whoever repairs it need not know of them.
+#[tokio::test]
+async fn what_is_kept_of_a_bare_folder_is_found() {
+    for (kept, expected) in [(VOLUME, Repair::Queued), ("other", Repair::Quarantined)] {
+        let mut fixture = Fixture::new().await;
+        let watched = tempfile::tempdir().unwrap();
+        let folder = watched.path().join(kept);
+        fs::rename(fixture.acquisition.path(), &folder).unwrap();
+        fixture.acquisition = tempfile::tempdir().unwrap();
+        fixture
+            .archive
+            .storage()
+            .delete(&fixture.names[3])
+            .await
+            .unwrap();
+        let options = CheckOptions {
+            repair: true,
+            // The bare folder, as a user names it.
+            acquisition: Some(fixture.acquisition.path().to_owned()),
+            watched: Some(watched.path().to_owned()),
+            ..CheckOptions::default()
+        };
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let found: Vec<_> = report.findings.iter().map(|f| (f.kind, f.repair)).collect();
+        assert_eq!(found, [(FindingKind::Missing, Some(expected))]);
+    }
+}
+
 #[tokio::test]
 async fn wrong_counts_are_made_right() {
     let fixture = Fixture::new().await;

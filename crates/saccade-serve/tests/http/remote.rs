@@ -67,12 +67,17 @@ fn a_remote_source_follows() {
 /// Labels of which one has no room in the volume.
 struct Wide {
     labels: ArraySource,
+    notes: Vec<String>,
     /// The chunk that has it.
     there: UVec3,
     met: AtomicBool,
 }
 
 impl VolumeSource for Wide {
+    fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
     fn volume(&self) -> &Arc<Volume> {
         self.labels.volume()
     }
@@ -99,6 +104,7 @@ fn ids_that_a_server_renames_are_known_where_they_are_read() {
         let there = UVec3::new(1, 1, 1);
         let source = Arc::new(Wide {
             labels: ArraySource::new(volume(), level0()).unwrap(),
+            notes: vec!["ids were mapped".to_owned()],
             there,
             met: AtomicBool::new(false),
         });
@@ -111,6 +117,7 @@ fn ids_that_a_server_renames_are_known_where_they_are_read() {
         };
         remote.read(id(UVec3::new(0, 1, 1))).await.unwrap();
         assert_eq!(remote.renamed_label(), None, "none was met yet");
+        assert_eq!(remote.notes(), ["ids were mapped"]);
         remote.read(id(there)).await.unwrap();
         assert_eq!(remote.renamed_label(), Some(70_000));
         // What was kept elsewhere says it as well, also where nothing is read again.

@@ -32,7 +32,8 @@ pub(crate) struct Check {
     #[arg(long)]
     repair: bool,
 
-    /// Folder that the microscope wrote to, from which damaged tiles can be made anew [default: none]
+    /// Folder that the microscope wrote to, from which damaged tiles can be made anew [default: of volumes from --pattern
+    /// or a list what is kept of them, else none]
     #[arg(long, value_name = "FOLDER", requires = "repair")]
     acquisition: Option<PathBuf>,
 
@@ -49,6 +50,7 @@ impl Check {
             quick: self.quick,
             repair: self.repair,
             acquisition: self.acquisition,
+            watched: super::ingest::beside(&location),
             ..CheckOptions::default()
         };
         // Draws nothing where there is no terminal.

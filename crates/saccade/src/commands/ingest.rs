@@ -147,7 +147,7 @@ async fn say_what_is_left(
 }
 
 /// Where what is found in folders without records is kept.
-fn beside(location: &ArchiveLocation) -> Option<PathBuf> {
+pub(super) fn beside(location: &ArchiveLocation) -> Option<PathBuf> {
     match (location.catalog(), location.folder()) {
         (CatalogLocation::File(file), _) => Some(file.with_file_name("watched")),
         (CatalogLocation::Postgres(_), folder) => folder.map(|folder| folder.join("watched")),
