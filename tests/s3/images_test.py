@@ -118,7 +118,7 @@ class Images(unittest.TestCase):
         self.assertEqual(set(self.proxy.answers), {(True, None)}, "every signature holds")
 
     def test_names_are_as_they_are(self):
-        prefix = "Gewebe ä/50%20 #1+"
+        prefix = "Gewebe_ä/50%20#1+"
         quoted = quote(prefix)
         self.store.put_folder(self.work / self.images[0], BUCKET, quoted)
         place = f"s3://{BUCKET}/{prefix}"

@@ -225,8 +225,10 @@ impl HttpObjects {
         let status = answer.status();
         match status {
             StatusCode::OK | StatusCode::PARTIAL_CONTENT => {
-                self.is_the_same(key, part, answer.headers())?;
+                let headers = answer.headers().clone();
                 let bytes = answer::read(answer, part, self.patience, &shown(url)).await?;
+                // What marks an answer that cannot be used marks nothing.
+                self.is_the_same(key, part, &headers)?;
                 Ok(Found::Object(bytes))
             }
             StatusCode::NOT_FOUND | StatusCode::GONE => Ok(Found::Nothing),
