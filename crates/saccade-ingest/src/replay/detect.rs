@@ -145,11 +145,8 @@ impl Tree {
     }
 
     fn with_extension<'a>(&'a self, extension: &'a str) -> impl Iterator<Item = &'a Path> {
-        let matches = move |path: &&PathBuf| {
-            path.extension()
-                .is_some_and(|e| e.eq_ignore_ascii_case(extension))
-        };
-        self.files.iter().filter(matches).map(PathBuf::as_path)
+        let files = self.files.iter().map(PathBuf::as_path);
+        files.filter(move |path| has_extension(path, extension))
     }
 }
 
@@ -162,6 +159,13 @@ impl Tree {
 pub fn find_list(folder: &Path) -> Result<Option<PathBuf>, ReplayError> {
     let (tree, images) = (Tree::below(folder)?, Images::below(folder)?);
     if let Some((list, ..)) = chosen(&tree, &images)? {
+        if let Some(other) = another(&tree, &images, &list) {
+            log::warn!(
+                "several lists say where tiles lie, such as {} and {}; name the one that is meant with --list",
+                list.display(),
+                other.display()
+            );
+        }
         return Ok(Some(list));
     }
     for path in projects(&tree) {
@@ -231,6 +235,26 @@ fn chosen(tree: &Tree, images: &Images) -> Result<Option<(PathBuf, List, bool)>,
     }
 }
 
+/// Another list of images that are there.
+fn another<'a>(tree: &'a Tree, images: &Images, list: &Path) -> Option<&'a Path> {
+    /// Files besides the list that are read at most: some microscopes write one for each image.
+    const MOST: usize = 1000;
+    let text = tree.with_extension("txt");
+    let others = text.chain(tree.with_extension("json"));
+    let others = others.filter(|path| *path != list && small(path) && !lists::is_registered(path));
+    others.take(MOST).find(|path| {
+        lists::read(path).is_ok_and(|listed| {
+            let mut tiles = listed.tiles.iter();
+            tiles.any(|tile| images.find(&tile.file).is_some())
+        })
+    })
+}
+
+fn has_extension(path: &Path, extension: &str) -> bool {
+    path.extension()
+        .is_some_and(|e| e.eq_ignore_ascii_case(extension))
+}
+
 /// Where a project is, there was a list from which it was made.
 fn refuse_project_alone(tree: &Tree, images: &Images) -> Result<(), ReplayError> {
     for path in projects(tree) {
@@ -254,7 +278,7 @@ fn projects(tree: &Tree) -> impl Iterator<Item = &Path> {
 }
 
 fn small(path: &&Path) -> bool {
-    fs::metadata(path).is_ok_and(|meta| meta.len() <= LARGEST_LIST)
+    fs::metadata(path).is_ok_and(|meta| meta.is_file() && meta.len() <= LARGEST_LIST)
 }
 
 fn with_solution(

@@ -66,8 +66,14 @@ pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
     match tile_configuration::read(path) {
         Ok(tiles) => {
             let registered = tile_configuration::registered(path);
+            // A pipe would be waited for.
+            if path == registered || (registered.exists() && !registered.is_file()) {
+                return Ok(List {
+                    tiles,
+                    solution: None,
+                });
+            }
             let solution = match tile_configuration::read(&registered) {
-                _ if path == registered => None,
                 Ok(tiles) => Some(of_corners(&registered, &tiles)),
                 Err(AcquisitionError::Read { source, .. })
                     if source.kind() == io::ErrorKind::NotFound =>

@@ -10,6 +10,8 @@
 //!
 //! Lists count pixels from anywhere. Where the volume's corner and its first section lie, and how large it is, is
 //! settled when the list is first read, as replay settles it, and kept: what is listed later lies in the same frame.
+//! Registration counts from anywhere, too, and each time from elsewhere: its places are moved by their median distance
+//! from the list's, anew whenever it has put a tile elsewhere, not when it only knows more tiles than before.
 //!
 //! # Cost
 //!
@@ -22,7 +24,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use glam::UVec2;
+use glam::{DVec2, UVec2};
 use saccade_archive::acquisition::AcquisitionError;
 use saccade_core::transform::SectionFromTile;
 
@@ -107,6 +109,8 @@ pub struct ListWatch<F> {
     trouble: Option<Trouble>,
     frame: Option<Frame>,
     adopted: Option<Adopted>,
+    /// How far registration's places are moved, as it was said last.
+    shift_said: Option<DVec2>,
     /// The list of records, while this process is the one that writes it.
     records: Option<List>,
     tiles: BTreeMap<Arc<str>, Tile>,
@@ -167,6 +171,7 @@ impl<F: Folders> ListWatch<F> {
             trouble: None,
             adopted: frame.as_ref().and_then(|_| frame::adopted(&folder, kept)),
             frame,
+            shift_said: None,
             records: None,
             tiles: BTreeMap::new(),
             by_name: HashMap::new(),
@@ -211,13 +216,44 @@ impl<F: Folders> ListWatch<F> {
 
     /// Which images are not there, in words, if any are not.
     pub fn missing(&self) -> Option<String> {
-        let first = self.missing.first()?;
-        let file = &self.tiles.get(first)?.wanted.as_ref()?.file;
-        let (missing, all) = (self.missing.len(), self.tiles.len());
-        Some(format!(
-            "{missing} of the {all} images that the list names are not below {}, such as {file:?}",
-            self.folder.display()
-        ))
+        const SHOWN: usize = 3;
+        let odd = self.index.odd();
+        let (mut absent, mut first_absent, mut strange, mut whys) = (0_usize, None, 0, Vec::new());
+        for tile in &self.missing {
+            let Some(wanted) = self.tiles.get(tile).and_then(|tile| tile.wanted.as_ref()) else {
+                continue;
+            };
+            let file = &wanted.file;
+            let there = odd.get(base(file)).copied();
+            let Some(path) = there.or_else(|| self.index.folder(file)) else {
+                absent += 1;
+                first_absent = first_absent.or(Some(file));
+                continue;
+            };
+            strange += 1;
+            if whys.len() < SHOWN {
+                whys.push(format!("{:?} is {}", path, self.index.why(path)));
+            }
+        }
+        let all = self.tiles.len();
+        let mut said = Vec::new();
+        if strange > 0 {
+            let more = match strange - whys.len() {
+                0 => String::new(),
+                more => format!(", and {more} more"),
+            };
+            let whys = whys.join(", ");
+            said.push(format!(
+                "{strange} of the {all} images that the list names cannot be read: {whys}{more}"
+            ));
+        }
+        if let Some(file) = first_absent {
+            said.push(format!(
+                "{absent} of the {all} images that the list names are not below {}, such as {file:?}",
+                self.folder.display()
+            ));
+        }
+        (!said.is_empty()).then(|| said.join("; "))
     }
 
     /// Takes over what was settled before, by whichever process.

@@ -505,6 +505,150 @@ async fn a_solution_that_comes_later_moves_tiles() {
     assert_eq!(scope.records(), records);
 }
 
+/// Fiji begins wherever the first tile is: what counts is how its places differ from the list's.
+#[tokio::test]
+async fn registration_that_begins_elsewhere_is_the_same() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let tiles = |at: [f64; 2], places: &[f64]| {
+        let [x, y] = at;
+        let names = ["a", "b", "c", "d"].iter().zip(places);
+        let lines = names.map(|(name, place)| format!("{name}.tif; ; ({}, {y})\n", x + place));
+        format!("dim = 2\n{}", lines.collect::<String>())
+    };
+    for (seed, name) in (0..).zip(["a", "b", "c", "d"]) {
+        scope.image(name, seed);
+    }
+    let places = || async {
+        let tiles = seen(&archive).await;
+        let places = tiles.values().map(|tile| tile.transform[4..].to_vec());
+        places.collect::<Vec<_>>()
+    };
+    // The list's own corner of the volume stays, whatever registration counts from.
+    let config = || ListConfig {
+        origin: Some(DVec2::new(5.0, 2.0)),
+        ..roomy(&list)
+    };
+    write(&list, tiles([100.0, 50.0], &[0.0, 45.0, 90.0]));
+    write(&registered, tiles([1000.0, 1000.0], &[0.0, 46.5, 90.0]));
+    let want = vec![vec![95.0, 48.0], vec![141.5, 48.0], vec![185.0, 48.0]];
+    scope.once(config(), &archive).await;
+    assert_eq!(places().await, want);
+    let told = scope.records().len();
+    for corner in [[0.0, 0.0], [-700.25, 3e4], [1000.0, 1000.0]] {
+        write(&registered, tiles(corner, &[0.0, 46.5, 90.0]));
+        scope.once(config(), &archive).await;
+        assert_eq!(places().await, want, "{corner:?}");
+    }
+    assert_eq!(scope.records().len(), told, "nothing moved");
+
+    // Others, from elsewhere; and the same while somebody follows.
+    write(&registered, tiles([0.0, 0.0], &[0.0, 44.0, 90.0]));
+    scope.once(config(), &archive).await;
+    let other = vec![vec![95.0, 48.0], vec![139.0, 48.0], vec![185.0, 48.0]];
+    assert_eq!(places().await, other);
+    // One that only knows more moves nothing that is there.
+    write(&list, tiles([100.0, 50.0], &[0.0, 45.0, 90.0, 135.0]));
+    write(&registered, tiles([0.0, 0.0], &[0.0, 44.0, 90.0, 139.0]));
+    scope.once(config(), &archive).await;
+    let all = places().await;
+    assert_eq!((&all[..3], &all[3][..]), (&other[..], &[234.0, 48.0][..]));
+}
+
+/// Of what is nothing to read, nothing is opened, and the rest is taken in.
+#[cfg(unix)]
+#[tokio::test]
+async fn what_is_no_file_is_missing() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let names = ["a", "b", "c", "d", "e", "f"];
+    let lines = names.map(|name| format!("far/{name}.tif 0 0 0\n"));
+    write(&list, lines.concat());
+    scope.image("a", 1);
+    let link = |to: &Path, name: &str| std::os::unix::fs::symlink(to, scope.file(name)).unwrap();
+    link(&scope.file("nowhere.tif"), "pictures/b.tif");
+    for pipe in ["pictures/c.tif", "piped.txt", "piped.xml", "early/f.tif"] {
+        let path = scope.file(pipe);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let made = std::process::Command::new("mkfifo").arg(&path).status();
+        assert!(made.unwrap().success());
+    }
+    link(Path::new("/dev/zero"), "pictures/d.tif");
+    // Of two that have its name, the one that is a file.
+    scope.image("f", 6);
+    assert_eq!(find_list(&scope.path()).unwrap().as_ref(), Some(&list));
+    let watch = scope.once(roomy(&list), &archive).await;
+    let missing = watch.missing().unwrap();
+    drop(watch);
+    let said = [
+        "3 of the 6 images that the list names cannot be read",
+        r#""pictures/b.tif" is a link to nothing"#,
+        r#""pictures/c.tif" is no regular file"#,
+        r#""pictures/d.tif" is no regular file"#,
+        "1 of the 6 images that the list names are not below",
+        r#"such as "far/e.tif""#,
+    ];
+    for said in said {
+        assert!(missing.contains(said), "{missing}");
+    }
+    let taken: Vec<_> = seen(&archive).await.into_keys().collect();
+    assert_eq!(taken, ["a", "f"]);
+
+    // A link may lead to something later, while its folder stays as it is.
+    let mut watch = scope.watch(roomy(&list));
+    follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+    fs::write(scope.file("nowhere.tif"), tiff8(SIZE, &texture(SIZE, 2))).unwrap();
+    follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+    let missing = watch.missing().unwrap();
+    assert!(missing.contains("2 of the 6 images"), "{missing}");
+    assert!(!missing.contains("b.tif"), "{missing}");
+}
+
+/// A slip in a number binds nobody.
+#[tokio::test]
+async fn sections_that_no_volume_holds_are_refused_before_anything_is_kept() {
+    let scope = Scope::new();
+    let archive = archive(&scope.0.path().join("archive")).await;
+    scope.image("a", 1);
+    scope.image("b", 2);
+    let kinds = [
+        ("list.txt", "a.tif 0 0 Z\nb.tif 40 0 Y\n", 2),
+        (
+            "TileConfiguration.txt",
+            "dim = 3\na.tif; ; (0, 0, Z)\nb.tif; ; (40, 0, Y)\n",
+            3,
+        ),
+    ];
+    for (name, text, line) in kinds {
+        let list = scope.file(name);
+        let text = text.replace('Z', "7");
+        write(&list, text.replace('Y', "2000000000"));
+        let mut watch = scope.watch(config(&list));
+        let refused = follow(&mut watch, Until::End, true, &Cancel::new()).unwrap_err();
+        assert!(
+            matches!(refused, ListError::Sections { first: 7, .. }),
+            "{refused}"
+        );
+        let refused = refused.to_string();
+        let line = format!("line {line}: ");
+        let limit = saccade_core::volume::MAX_EXTENT.to_string();
+        for said in [&line, "b.tif", "2000000000", &limit, name] {
+            assert!(refused.contains(said), "{refused}");
+        }
+        drop(watch);
+        assert!(!scope.kept().join("volume.json").exists());
+        assert!(!scope.kept().join("watched.json").exists());
+        fs::remove_file(list).unwrap();
+    }
+    let list = scope.file("list.txt");
+    write(&list, "a.tif 0 0 7\nb.tif 40 0 8\n");
+    scope.once(config(&list), &archive).await;
+    assert_eq!(seen(&archive).await.len(), 2);
+}
+
 #[tokio::test]
 async fn it_goes_on_as_it_was_begun_or_not_at_all() {
     let scope = Scope::new();

@@ -12,6 +12,7 @@ use saccade_ingest::replay::find_list;
 use saccade_ingest::watch::{ListConfig, Pattern, WatchConfig, kept_list};
 
 use crate::arguments::{corner, extent, pitch, scale, voxel_nm};
+use crate::report::say;
 
 /// A folder without records: file names, or a list, say what lies where.
 #[derive(Args)]
@@ -117,6 +118,10 @@ impl Bare {
                     return Err(nothing.into());
                 };
                 let config = self.listed(list, name)?;
+                say(&format!(
+                    "the places are those of {}",
+                    config.list.display()
+                ));
                 // One that was followed before may be about to be mended.
                 if before.is_none() {
                     config.check()?;

@@ -103,6 +103,27 @@ pub enum ListError {
         /// The list.
         list: PathBuf,
     },
+    /// The sections span too much.
+    #[error(
+        "the sections of the list are too many for a volume, which has {most} at most: {}{file:?} is in section \
+         {section}, and the first one is {first}; mend the list, or say --extent: {}",
+        line.map_or_else(String::new, |line| format!("line {line}: ")),
+        list.display()
+    )]
+    Sections {
+        /// The image of the last section.
+        file: String,
+        /// Its line, if it was found.
+        line: Option<usize>,
+        /// Its section.
+        section: u32,
+        /// The volume's first section.
+        first: u32,
+        /// Sections that a volume has at most.
+        most: u32,
+        /// The list.
+        list: PathBuf,
+    },
     /// The tiles span too much.
     #[error(transparent)]
     Frame(#[from] ReplayError),
@@ -123,7 +144,7 @@ impl ListError {
             | Self::Gone { .. }
             | Self::Empty { .. }
             | Self::NoImages { .. } => true,
-            Self::Watch(_) | Self::Frame(_) => false,
+            Self::Watch(_) | Self::Sections { .. } | Self::Frame(_) => false,
         }
     }
 

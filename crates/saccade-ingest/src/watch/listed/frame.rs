@@ -9,12 +9,13 @@ use glam::{DVec2, UVec2, UVec3};
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::image::{read_bits, read_size};
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::Dtype;
+use saccade_core::volume::{Dtype, MAX_EXTENT};
 
 use super::super::{LINK, SETTINGS, WatchError, is_unused};
 use super::index::Index;
-use super::source::{Adopted, Listing, adopt, raw};
+use super::source::{Adopted, Listing, adopt, line_of, raw};
 use super::{ListConfig, ListError};
+use crate::replay::ReplayError;
 use crate::replay::acquisition::spanned;
 use crate::replay::lists::Solution;
 use crate::simulate::settings::{Settings, difference, volume_differences};
@@ -217,8 +218,29 @@ pub(super) fn begin(
         let (low, size) = spanned(&raw, &config.list)?;
         let corner = *origin.get_or_insert(low);
         let size = ((low + size - corner) * config.scale).ceil();
-        let last = tiles.iter().map(|tile| tile.section).max().unwrap_or(0);
-        let sections = last.saturating_sub(first).saturating_add(1);
+        let last = tiles.iter().max_by_key(|tile| tile.section);
+        let sections = last.map_or(0, |tile| tile.section);
+        let sections = sections.saturating_sub(first).saturating_add(1);
+        if extent.is_none() && size.max_element() > f64::from(MAX_EXTENT) {
+            let list = config.list.clone();
+            let (width, height) = (size.x, size.y);
+            return Err(ReplayError::Extent {
+                width,
+                height,
+                list,
+            }
+            .into());
+        }
+        if let Some(tile) = last.filter(|_| extent.is_none() && sections > MAX_EXTENT) {
+            return Err(ListError::Sections {
+                line: line_of(&config.list, tile),
+                file: tile.file.clone(),
+                section: tile.section,
+                first,
+                most: MAX_EXTENT,
+                list: config.list.clone(),
+            });
+        }
         extent.get_or_insert(size.max(DVec2::ONE).as_uvec2().extend(sections));
     }
     let mut info =

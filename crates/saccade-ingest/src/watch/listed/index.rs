@@ -4,8 +4,10 @@
 //! where the last one stopped. Sixteen bytes are kept per file.
 
 use std::collections::{BTreeSet, HashMap};
+use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
+use std::ops::Bound;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -43,6 +45,10 @@ pub(super) struct Index {
     files: HashMap<u64, usize>,
     /// Files that may be projects of TrakEM2, below the root.
     projects: BTreeSet<PathBuf>,
+    /// What was looked for and is nothing to read, below the root.
+    odd: BTreeSet<PathBuf>,
+    /// Which of them was looked at again last.
+    odd_at: PathBuf,
     changed: bool,
     went_round: bool,
 }
@@ -50,6 +56,19 @@ pub(super) struct Index {
 /// The hash by which a name or path is known.
 pub(super) fn key(name: &str) -> u64 {
     BuildHasherDefault::<DefaultHasher>::default().hash_one(name)
+}
+
+/// Why what lies there is nothing to read; `None` if it is a file, or if nothing is there. Nothing is opened.
+fn oddity(path: &Path) -> Option<&'static str> {
+    let is_gone = |e: &io::Error| e.kind() == io::ErrorKind::NotFound;
+    match (fs::metadata(path), fs::symlink_metadata(path)) {
+        (Ok(to), _) if to.is_file() => None,
+        (Ok(_), _) => Some("no regular file"),
+        (Err(e), Ok(_)) if is_gone(&e) => Some("a link to nothing"),
+        (Err(_), Ok(_)) => Some("a link that cannot be followed"),
+        (_, Err(e)) if is_gone(&e) => None,
+        (_, Err(_)) => Some("not to be looked at"),
+    }
 }
 
 /// A path's last part; lists are written by programs that separate folders by either slash.
@@ -72,6 +91,8 @@ impl Index {
             listing: None,
             files: HashMap::new(),
             projects: BTreeSet::new(),
+            odd: BTreeSet::new(),
+            odd_at: PathBuf::new(),
             changed: false,
             went_round: false,
         }
@@ -99,8 +120,11 @@ impl Index {
         if self.root.join(&path).is_file() {
             return path.to_str().map(ToOwned::to_owned);
         }
-        // It is gone; another of its name may be there.
+        // It is gone, or nothing to read; another of its name may be there.
         self.files.remove(&key(name));
+        if oddity(&self.root.join(&path)).is_some() {
+            self.odd.insert(path);
+        }
         for folder in &mut self.folders {
             folder.listed = None;
         }
@@ -115,6 +139,48 @@ impl Index {
         base(found) == base(file)
             && named
                 .is_none_or(|named| named == Path::new(found) || !self.root.join(named).is_file())
+    }
+
+    /// What was looked for and is nothing to read, by its name.
+    pub(super) fn odd(&self) -> HashMap<&str, &Path> {
+        let all = self.odd.iter().map(PathBuf::as_path);
+        all.filter_map(|path| Some((path.file_name()?.to_str()?, path)))
+            .collect()
+    }
+
+    /// Why what lies at a path below the root is nothing to read.
+    pub(super) fn why(&self, path: &Path) -> &'static str {
+        oddity(&self.root.join(path)).unwrap_or("only just a file")
+    }
+
+    /// The folder that a list calls `file`, as if it were an image.
+    pub(super) fn folder(&self, file: &str) -> Option<&Path> {
+        let (path, _) = self
+            .paths
+            .get_key_value(&image_path(Path::new(""), file)?)?;
+        Some(path)
+    }
+
+    /// Looks again at some of what is nothing to read: links may lead to something later.
+    fn look_at_odd(&mut self) {
+        const AT_ONCE: usize = 64;
+        let after = (Bound::Excluded(self.odd_at.clone()), Bound::Unbounded);
+        let some: Vec<_> = self.odd.range(after).take(AT_ONCE).cloned().collect();
+        self.odd_at = match some.last() {
+            Some(last) if some.len() == AT_ONCE => last.clone(),
+            _ => PathBuf::new(),
+        };
+        for path in some {
+            if oddity(&self.root.join(&path)).is_some() {
+                continue;
+            }
+            let folder = path.parent().and_then(|folder| self.paths.get(folder));
+            if let Some(folder) = folder {
+                self.folders[*folder].listed = None;
+                self.changed = true;
+            }
+            self.odd.remove(&path);
+        }
     }
 
     /// Goes on with the round of the folders, to its end or with so many questions: the files of folders that
@@ -133,6 +199,7 @@ impl Index {
             let Some(folder) = self.folders.get(self.at) else {
                 self.at = 0;
                 self.went_round = true;
+                self.look_at_odd();
                 let next = match std::mem::take(&mut self.changed) {
                     true => Next::Again,
                     false => Next::Rest,
@@ -201,6 +268,12 @@ impl Index {
                 });
             }
             return;
+        }
+        if self.odd.contains(&path) {
+            if oddity(&self.root.join(&path)).is_some() {
+                return;
+            }
+            self.odd.remove(&path);
         }
         let known = self.files.entry(key(&name)).or_insert(at);
         if self.folders[at].path.join(&name) < self.folders[*known].path.join(&name) {

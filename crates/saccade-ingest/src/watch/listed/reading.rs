@@ -5,14 +5,15 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use glam::UVec2;
+use glam::{DVec2, UVec2};
 use saccade_archive::acquisition::{AcquisitionError, DeleteRecord, Record, TransformRecord};
 use saccade_core::transform::SectionFromTile;
 
 use super::super::{BEFORE_FIRST, Folders};
 use super::index::{base, key};
-use super::source::{self, Listing, State, adopt, raw, solution_again};
+use super::source::{self, Listing, State, adopt, offset, raw, solution_again};
 use super::{Image, ListError, ListWatch, Tile, Trouble, Wanted, frame};
+use crate::replay::RawTile;
 
 impl<F: Folders> ListWatch<F> {
     /// Reads the list if it has changed and rests. Whether it may soon be read.
@@ -60,16 +61,14 @@ impl<F: Folders> ListWatch<F> {
             (self.frame, self.adopted) = (Some(frame), adopted);
         } else if let Some(adopted) = &mut self.adopted {
             match solution_again(&adopted.solution.path, listing.own.as_ref()) {
-                Ok(solution) => adopted.solution = solution,
+                Ok(solution) => {
+                    adopted.solution = solution;
+                    self.align(&listing)?;
+                }
                 Err(e) => return self.unreadable(e),
             }
         } else {
-            let size = |n: usize| {
-                let told = self.tiles.get(&*listing.tiles[n].name);
-                told.and_then(|t| t.told.as_ref())
-                    .map_or(UVec2::ONE, |told| told.size)
-            };
-            match adopt(&listing, &projects, raw(&listing.tiles, size)) {
+            match adopt(&listing, &projects, self.raw(&listing)) {
                 Ok(None) => {}
                 Ok(Some(adopted)) => {
                     let path = adopted.solution.path.display();
@@ -80,9 +79,59 @@ impl<F: Folders> ListWatch<F> {
                 Err(e) => return self.unreadable(e),
             }
         }
+        self.say_shift();
         self.files.are_read();
         self.enter(listing, now);
         Ok(false)
+    }
+
+    fn raw(&self, listing: &Listing) -> Vec<RawTile> {
+        raw(&listing.tiles, |n: usize| {
+            let told = self.tiles.get(&*listing.tiles[n].name);
+            told.and_then(|t| t.told.as_ref())
+                .map_or(UVec2::ONE, |told| told.size)
+        })
+    }
+
+    /// Finds out anew how far the solution's frame is from the list's, unless all tiles that are there lie where it
+    /// says: then it knows more of them at most.
+    fn align(&mut self, listing: &Listing) -> Result<(), ListError> {
+        let raw = self.raw(listing);
+        let Some((adopted, frame)) = self.adopted.as_mut().zip(self.frame.as_ref()) else {
+            return Ok(());
+        };
+        let there = listing.tiles.iter().filter_map(|named| {
+            let told = self.tiles.get(&*named.name)?.told.as_ref()?;
+            Some((told.transform, frame.place(adopted.place(named)?)))
+        });
+        let mut there = there.peekable();
+        if there.peek().is_some() && there.all(|(told, now)| same_place(told, now)) {
+            return Ok(());
+        }
+        if let Some(offset) = offset(&adopted.solution, raw)
+            && offset != adopted.offset
+        {
+            adopted.offset = offset;
+            frame::keep_adopted(self.adopted.as_ref(), &self.folder, &self.kept)?;
+        }
+        Ok(())
+    }
+
+    /// Says how far registration's places are moved, once, and when that changes.
+    fn say_shift(&mut self) {
+        let Some(adopted) = &self.adopted else {
+            return;
+        };
+        let before = self.shift_said.replace(adopted.offset);
+        if before == Some(adopted.offset) {
+            return;
+        }
+        let DVec2 { x, y } = -adopted.offset;
+        let path = adopted.solution.path.display();
+        log::info!(
+            "registration's places are moved by {x:.3}, {y:.3} pixels to where the list has the tiles, in whose pixels \
+             --origin counts: {path}"
+        );
     }
 
     fn unreadable(&mut self, error: AcquisitionError) -> Result<bool, ListError> {

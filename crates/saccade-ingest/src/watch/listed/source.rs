@@ -1,6 +1,7 @@
 //! The list as it stands in its file, and what registration made of it.
 
 use std::collections::{BTreeSet, HashSet};
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
@@ -40,6 +41,13 @@ pub(super) struct Listing {
 
 /// Reads a list, or a TrakEM2 project as one.
 pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
+    // A pipe would be waited for.
+    if path.metadata().is_ok_and(|meta| !meta.is_file()) {
+        return Err(AcquisitionError::Read {
+            source: io::Error::other("it is no regular file"),
+            path: path.to_owned(),
+        });
+    }
     let is_xml = path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("xml"));
@@ -70,6 +78,22 @@ pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
     let mut tiles: Vec<_> = named.collect();
     tiles.sort_by_key(|tile| tile.section);
     Ok(Listing { tiles, own })
+}
+
+/// The line of a list, counted from 1, that has a tile in its section; for messages.
+pub(super) fn line_of(list: &Path, tile: &Named) -> Option<usize> {
+    let text = fs::read(list).ok()?;
+    let text = String::from_utf8_lossy(&text);
+    let section = f64::from(tile.section);
+    let mut lines = (1..).zip(text.lines()).filter(|(_, line)| {
+        let words = line.split(|c: char| !(c.is_ascii_alphanumeric() || ".+-".contains(c)));
+        let mut numbers = words.filter_map(|word| word.parse::<f64>().ok());
+        numbers.any(|number| number == section)
+    });
+    let first = lines.next()?;
+    let named = |(_, line): &(usize, &str)| line.contains(&tile.file);
+    let best = [first].into_iter().chain(lines).find(named);
+    Some(best.unwrap_or(first).0)
 }
 
 /// A name that no tile listed before has, so that what comes later in the list changes none.
@@ -128,7 +152,7 @@ pub(super) fn raw(tiles: &[Named], size: impl Fn(usize) -> UVec2) -> Vec<RawTile
 pub(super) fn adopt(
     listing: &Listing,
     projects: &[PathBuf],
-    mut raw: Vec<RawTile>,
+    raw: Vec<RawTile>,
 ) -> Result<Option<Adopted>, AcquisitionError> {
     let wanted: BTreeSet<&str> = listing.tiles.iter().map(|t| t.stem.as_str()).collect();
     // Names that mean several tiles cannot be looked up.
@@ -136,18 +160,26 @@ pub(super) fn adopt(
         return Ok(None);
     }
     let mut solutions = Vec::from_iter(listing.own.clone());
-    let small = |path: &&PathBuf| path.metadata().is_ok_and(|meta| meta.len() <= LARGEST_LIST);
+    let small = |path: &&PathBuf| {
+        let meta = path.metadata();
+        meta.is_ok_and(|meta| meta.is_file() && meta.len() <= LARGEST_LIST)
+    };
     for project in projects.iter().filter(small).filter(|p| is_project(p)) {
         solutions.push(Solution::read(project)?);
     }
     let Some(solution) = best(&wanted, &raw, solutions) else {
         return Ok(None);
     };
+    let offset = offset(&solution, raw).unwrap_or_default();
+    Ok(Some(Adopted { solution, offset }))
+}
+
+/// How far a solution's frame is from the list's \[pixels\]; `None` if it has none of the tiles.
+pub(super) fn offset(solution: &Solution, mut raw: Vec<RawTile>) -> Option<DVec2> {
     for tile in &mut raw {
         tile.aligned = solution.transforms.get(&tile.name).copied();
     }
-    let offset = median_offset(&raw).unwrap_or_default();
-    Ok(Some(Adopted { solution, offset }))
+    median_offset(&raw)
 }
 
 /// The solution in that file as it is now.
