@@ -88,7 +88,7 @@ pub(super) fn line_of(list: &Path, tile: &Named) -> Option<usize> {
     let mut lines = (1..).zip(text.lines()).filter(|(_, line)| {
         let words = line.split(|c: char| !(c.is_ascii_alphanumeric() || ".+-".contains(c)));
         let mut numbers = words.filter_map(|word| word.parse::<f64>().ok());
-        numbers.any(|number| number == section)
+        numbers.any(|number| (number - section).abs() < 0.5)
     });
     let first = lines.next()?;
     let named = |(_, line): &(usize, &str)| line.contains(&tile.file);
