@@ -8,7 +8,7 @@ use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BrickId};
 use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
-use saccade_render::{BrickVoxels, FrameReport, Renderer, View};
+use saccade_render::{BrickVoxels, FrameReport, Renderer, RendererOptions, View};
 
 use crate::clock::DrawClock;
 
@@ -147,4 +147,13 @@ pub(crate) fn frame_ms(renderer: &mut Renderer, view: &View) -> f64 {
     renderer.render(view);
     pollster::block_on(renderer.finish());
     start.ms()
+}
+
+/// Options with which all that arrived is in the octree before the next frame: for rows that measure what is there, not how it
+/// gets there.
+pub(crate) fn at_once() -> RendererOptions {
+    RendererOptions {
+        nodes_per_frame: u64::from(u32::MAX),
+        ..RendererOptions::default()
+    }
 }

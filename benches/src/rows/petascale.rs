@@ -16,7 +16,7 @@ use saccade_render::{ChannelView, FrameReport, Gpu, Renderer, RendererOptions, V
 
 use super::table_9_1::{Drawn, mean, time_of};
 use crate::baselines::{Baseline, Method, Work};
-use crate::bricks::{Bricks, ramp, settle_loading};
+use crate::bricks::{Bricks, at_once, ramp, settle_loading};
 use crate::plot::{Axis, Plot};
 use crate::report::Row;
 use crate::settings::Settings;
@@ -154,7 +154,7 @@ fn renderer(gpu: &Gpu, volume: &std::sync::Arc<Volume>, scale: Scale) -> Result<
             depth: 2,
             block_edge: 32,
         }),
-        ..RendererOptions::default()
+        ..at_once()
     };
     Ok(Renderer::new(gpu, volume.clone(), options)?)
 }
@@ -262,7 +262,7 @@ fn both(
     };
     let options = RendererOptions {
         memory_bytes: bytes,
-        ..RendererOptions::default()
+        ..at_once()
     };
     let mut renderer = Renderer::new(gpu, volume.clone(), options)?;
     renderer.set_channels(views)?;

@@ -7,7 +7,7 @@ use saccade_core::camera::Camera;
 use saccade_render::{Gpu, Renderer, RendererOptions, Statistics, View, wgpu};
 
 use crate::baselines::{Baseline, Method, Work};
-use crate::bricks::settle;
+use crate::bricks::{at_once, settle};
 use crate::clock::Stopwatch;
 use crate::cpu;
 use crate::plot::{Axis, Plot};
@@ -157,7 +157,7 @@ fn ours(
     let options = RendererOptions {
         memory_bytes: cache_bytes(scale),
         octree_cell: leaf,
-        ..RendererOptions::default()
+        ..at_once()
     };
     let mut renderer = Renderer::new(gpu, case.formula.volume.clone(), options)?;
     renderer.set_channels(&case.views)?;

@@ -12,7 +12,7 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{Gpu, Renderer, RendererOptions, Traversal, View};
 
-use crate::bricks::{Arrays, Bricks, frame_ms, ramp, settle};
+use crate::bricks::{Arrays, Bricks, at_once, frame_ms, ramp, settle};
 use crate::dense::Dense;
 use crate::report::Row;
 
@@ -75,7 +75,7 @@ pub(crate) fn vs_dense_texture() -> Result<Vec<Row>> {
         lod_bias: -20.0,
         ..View::new(Camera::around(&arrays.volume).zoomed(1.3), SIZE)
     };
-    let options = RendererOptions::default();
+    let options = at_once();
     let (mut ours, statistics) = renderer(gpu, &arrays.volume, options, &view, &arrays, &transfer)?;
     let tables = RendererOptions {
         traversal: Traversal::PageTables,
@@ -161,7 +161,7 @@ pub(crate) fn vs_small_volume() -> Result<Vec<Row>> {
             ..Camera::around(&volume)
         };
         let view = View::new(camera, SIZE / 2);
-        let options = RendererOptions::default();
+        let options = at_once();
         let (renderer, _) = renderer(gpu, &volume, options, &view, &island, &transfer)?;
         anyhow::Ok((renderer, view))
     });
@@ -225,7 +225,7 @@ pub(crate) fn vs_page_tables() -> Result<Vec<Row>> {
     let prepare = |traversal| {
         let options = RendererOptions {
             traversal,
-            ..RendererOptions::default()
+            ..at_once()
         };
         renderer(gpu, &arrays.volume, options, &view, &arrays, &transfer)
     };
