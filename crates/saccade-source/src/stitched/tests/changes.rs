@@ -360,7 +360,10 @@ proptest! {
             let found = again.statistics().blocks_from_disk;
             let any = fresh.iter().flatten().any(|v| *v != 0);
             prop_assert_eq!(found > 0, any, "{} blocks found", found);
-            prop_assert_eq!(again.statistics().blocks_built, 0);
+            // A level is one block here; one without voxels is not worth keeping.
+            let empty = fresh.iter().filter(|level| level.iter().all(|v| *v == 0)).count();
+            let built = again.statistics().blocks_built;
+            prop_assert!(built <= empty as u64, "{} built, {} are empty", built, empty);
             // The oracle leaves gaps as they are.
             if rules.2 == Gaps::Empty {
                 let how = How {
