@@ -268,7 +268,7 @@ async fn caught_up(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 8, ..ProptestConfig::default() })]
     #[test]
     fn nothing_stale_remains(steps in steps(), rules in rules()) {
         run(async {
@@ -286,6 +286,7 @@ proptest! {
             let keeping = fixture.open_with(keeping).await;
             read_all(&keeping).await;
             let mut kept_changes = keeping.changes();
+            let opened_at = keeping.revision();
             let volume = fixture.volume.clone();
             let ids: Vec<_> = (0..).zip(&volume.levels).flat_map(|(level, _)| {
                 let chunks = VoxelBox::of_size(volume.chunks(level as usize));
@@ -344,8 +345,9 @@ proptest! {
                 caught_up(&fixture, &mut changes).await;
             }
             let newest = fixture.archive.catalog().revision("v").await.unwrap();
-            while keeping.revision() < newest {
-                kept_changes.next().await.unwrap();
+            // By what is told, not by the number beside it, which may be a moment behind or ahead.
+            if newest > opened_at {
+                while kept_changes.next().await.unwrap().revision < newest {}
             }
             let thumbnails = keeping.statistics().thumbnail_bytes;
             prop_assert!(thumbnails > 0, "the coarse levels are made of them");
