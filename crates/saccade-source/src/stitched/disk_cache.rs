@@ -6,7 +6,7 @@
 //! revision, and of how they are stitched. The plan's whole description is kept with the block and
 //! compared with the present one before the block is used, so a tile that came, moved, was imaged
 //! again or deleted since makes it another block. What nobody asks for any more is written over in
-//! time, oldest first. A thumbnail is a function of its pyramid, which never changes.
+//! time, oldest first: each time the folder is opened and written to, another unit is begun. A thumbnail is a function of its pyramid, which never changes.
 //!
 //! # Failure
 //!
@@ -18,9 +18,9 @@ use std::error::Error;
 use std::fmt;
 use std::fs::File;
 use std::hash::{BuildHasher, Hasher, RandomState};
-use std::io;
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bytes::{BufMut, Bytes, BytesMut};
 use foyer::{
@@ -109,8 +109,8 @@ pub struct DiskCache(Arc<Inner>);
 
 struct Inner {
     blocks: HybridCache<u64, Bytes>,
-    /// Locked while the folder is in use; `None` once closed.
-    lock: RwLock<Option<File>>,
+    /// Locked while the folder is in use; `None` once closed. Held by whoever writes, one at a time.
+    lock: Mutex<Option<File>>,
 }
 
 impl fmt::Debug for DiskCache {
@@ -168,16 +168,14 @@ impl DiskCache {
         let (blocks, lock) = opened.map_err(failed)??;
         Ok(Self(Arc::new(Inner {
             blocks,
-            lock: RwLock::new(Some(lock)),
+            lock: Mutex::new(Some(lock)),
         })))
     }
 
     /// Writes what waits to be written, and leaves the folder to others. Clones that are still held, by
     /// work that nobody waits for any more, find and keep nothing from here on.
     pub async fn close(&self) {
-        let lock = { self.0.lock.write() }
-            .unwrap_or_else(PoisonError::into_inner)
-            .take();
+        let lock = self.folder().take();
         let Some(lock) = lock else { return };
         if let Err(error) = self.0.blocks.close().await {
             log::warn!("the cache on disk was not closed: {error}");
@@ -188,14 +186,14 @@ impl DiskCache {
         }
     }
 
-    /// Whether the folder is still this cache's.
-    fn open_still(&self) -> RwLockReadGuard<'_, Option<File>> {
-        self.0.lock.read().unwrap_or_else(PoisonError::into_inner)
+    /// The folder, as long as it is this cache's.
+    fn folder(&self) -> MutexGuard<'_, Option<File>> {
+        self.0.lock.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// What was made of what this description describes.
     pub(super) async fn get(&self, description: &[u8]) -> Option<Bytes> {
-        if self.open_still().is_none() {
+        if self.folder().is_none() {
             return None;
         }
         let loaded = self.0.blocks.storage().load(&key(description)).await;
@@ -220,9 +218,11 @@ impl DiskCache {
         kept.put_u64_le(description.len() as u64);
         kept.put_slice(description);
         kept.put_slice(bytes);
-        // Held over the insertion, so that closing begins before it or waits for what it wrote.
-        let open = self.open_still();
-        if open.is_some() {
+        // Held over the insertion, so that closing begins before it or waits for what it wrote; and by one at a
+        // time: the library numbers what is inserted before it lines it up, and what lies on disk behind a
+        // higher number is not found again when the folder is opened next.
+        let folder = self.folder();
+        if folder.is_some() {
             let writer = self.0.blocks.storage_writer(key(description)).force();
             writer.insert(kept.freeze());
         }
@@ -325,6 +325,13 @@ fn number_of(entry: &std::fs::DirEntry) -> Option<u64> {
     name.to_str()?.strip_prefix(FILES)?.parse().ok()
 }
 
+/// Whether a unit has been written to: a free one begins with a page of zeros, or is a hole.
+fn is_written(unit: &Path) -> io::Result<bool> {
+    let mut page = [0; 4096];
+    File::open(unit)?.read_exact(&mut page)?;
+    Ok(page.iter().any(|byte| *byte != 0))
+}
+
 /// Whether a folder may become a cache, or is one: also one of an earlier version, which had no marker.
 fn is_cache(folder: &Path) -> io::Result<bool> {
     if folder.join(MARKER).is_file() {
@@ -360,16 +367,28 @@ fn prepare(folder: &Path, units: Units) -> io::Result<Prepared> {
         "blocks of voxels that Saccade has stitched\n",
     )?;
     let mut kept = BTreeSet::new();
+    let mut written = Vec::new();
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;
         let metadata = entry.metadata()?;
         if let Some(number) = number_of(&entry).filter(|_| metadata.is_file()) {
             if number < units.count && metadata.len() == units.bytes {
                 kept.insert(number);
+                if is_written(&entry.path())? {
+                    written.push((metadata.modified()?, number, entry.path()));
+                }
             } else {
                 std::fs::remove_file(entry.path())?;
             }
         }
+    }
+    // A process that is killed while it frees a unit leaves none that is free, and the library frees one only when
+    // it has taken another: it would wait for ever, and so would whoever closes the cache.
+    if written.len() as u64 == units.count
+        && let Some((_, number, oldest)) = written.into_iter().min()
+    {
+        std::fs::remove_file(oldest)?;
+        kept.remove(&number);
     }
     let made = Made {
         folder: !there,

@@ -29,7 +29,11 @@ fn run<T>(test: impl Future<Output = T>) -> T {
     let mut runtime = tokio::runtime::Builder::new_multi_thread();
     let runtime = runtime.worker_threads(2).enable_all().build().unwrap();
     let limited = async { tokio::time::timeout(Duration::from_secs(60), test).await };
-    runtime.block_on(limited).expect("the test ends in time")
+    let ended = runtime.block_on(limited);
+    // As the program ends: a cache on disk that has not been closed and frees a unit while its threads are told to
+    // stop holds a lock for ever, and whoever waits for the threads with it.
+    runtime.shutdown_background();
+    ended.expect("the test ends in time")
 }
 
 /// Where tiles lie: most sections have six, some have none.

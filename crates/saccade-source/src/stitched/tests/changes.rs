@@ -251,9 +251,10 @@ fn options_of((overlaps, along_z, gaps): Rules) -> StitchedOptions {
     }
 }
 
+/// With a cache on disk that no series of steps fills: each time that it is opened, a unit is begun.
 async fn cached(folder: &Path, rules: Rules) -> StitchedOptions {
     StitchedOptions {
-        disk_cache: Some(DiskCache::open(folder, 0).await.unwrap()),
+        disk_cache: Some(DiskCache::open(folder, 2 << 30).await.unwrap()),
         ..options_of(rules)
     }
 }
@@ -268,7 +269,7 @@ async fn caught_up(
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 8, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
     #[test]
     fn nothing_stale_remains(steps in steps(), rules in rules()) {
         run(async {
@@ -357,9 +358,18 @@ proptest! {
             // What the disk has now is what will be.
             drop(source);
             options.disk_cache.take().unwrap().close().await;
-            let again = fixture.open_with(cached(folder.path(), rules).await).await;
+            let mut options = cached(folder.path(), rules).await;
+            let again = fixture.open_with(options.clone()).await;
             prop_assert!(read_all(&again).await == fresh, "stale voxels on disk");
-            // How much is found there, `disk` tests: a disk that is busy may take less than it is given.
+            let found = again.statistics().blocks_from_disk;
+            let any = fresh.iter().flatten().any(|v| *v != 0);
+            prop_assert_eq!(found > 0, any, "{} blocks found", found);
+            // A level is one block here; one without voxels is not worth keeping.
+            let empty = fresh.iter().filter(|level| level.iter().all(|v| *v == 0)).count();
+            let built = again.statistics().blocks_built;
+            prop_assert!(built <= empty as u64, "{} built, {} are empty", built, empty);
+            drop(again);
+            options.disk_cache.take().unwrap().close().await;
             // The oracle leaves gaps as they are.
             if rules.2 == Gaps::Empty {
                 let how = How {

@@ -278,3 +278,70 @@ fn a_cache_of_other_units_begins_anew() {
         }
     });
 }
+
+/// What several threads keep at the same time is found after a restart, all of it.
+#[test]
+fn all_that_was_kept_at_once_is_found_again() {
+    run(async {
+        const THREADS: u32 = 4;
+        let folder = tempfile::tempdir().unwrap();
+        for round in 0..8_u32 {
+            let names = (0..THREADS).map(|thread| {
+                let name = move |n: u32| format!("{round} {thread} {n}").into_bytes();
+                (0..200).map(name).collect::<Vec<_>>()
+            });
+            let names: Vec<_> = names.collect();
+            // Large enough that no round turns out another's.
+            let cache = DiskCache::open(folder.path(), 1 << 30).await.unwrap();
+            std::thread::scope(|scope| {
+                for names in &names {
+                    scope.spawn(|| names.iter().for_each(|name| cache.put(name, name)));
+                }
+            });
+            cache.close().await;
+            let cache = DiskCache::open(folder.path(), 1 << 30).await.unwrap();
+            for name in names.iter().flatten() {
+                let kept = cache.get(name).await;
+                assert_eq!(kept.as_deref(), Some(&name[..]), "round {round}");
+            }
+            assert_eq!(cache.get(b"another").await, None);
+            cache.close().await;
+        }
+    });
+}
+
+/// A process that was killed while a unit was being freed leaves none that is free.
+#[test]
+fn a_cache_without_a_free_unit_is_used_on() {
+    run(async {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = DiskCache::open(folder.path(), 0).await.unwrap();
+        cache.put(b"old", b"voxels");
+        cache.close().await;
+        let unit = |n: u32| {
+            folder
+                .path()
+                .join(format!("foyer-storage-direct-fs-{n:08}"))
+        };
+        let written = |n: &u32| {
+            std::fs::read(unit(*n)).unwrap()[..4096]
+                .iter()
+                .any(|b| *b != 0)
+        };
+        let one: Vec<_> = (0..4).filter(written).collect();
+        assert_eq!(one.len(), 1, "{one:?}");
+        for n in (0..4).filter(|n| *n != one[0]) {
+            std::fs::copy(unit(one[0]), unit(n)).unwrap();
+        }
+        let cache = DiskCache::open(folder.path(), 0).await.unwrap();
+        assert_eq!(cache.get(b"old").await.as_deref(), Some(&b"voxels"[..]));
+        cache.put(b"new", b"other voxels");
+        cache.close().await;
+        let cache = DiskCache::open(folder.path(), 0).await.unwrap();
+        assert_eq!(
+            cache.get(b"new").await.as_deref(),
+            Some(&b"other voxels"[..])
+        );
+        cache.close().await;
+    });
+}
