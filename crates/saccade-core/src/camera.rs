@@ -40,13 +40,24 @@ impl Camera {
     /// Opening angle unless another is asked for \[degrees\].
     pub const FOV: f64 = 35.0;
 
-    /// Sees the whole volume, from a corner.
+    /// Sees the whole volume, from a corner, on a picture at least as wide as it is high.
     pub fn around(volume: &Volume) -> Self {
+        Self::framing(volume, DVec2::ONE)
+    }
+
+    /// Sees the whole volume, from a corner, on a picture of this size \[any unit\]: from farther away where
+    /// it is narrow.
+    pub fn framing(volume: &Volume, image: DVec2) -> Self {
         let size = volume.size_nm();
         let radius = size.length() / 2.0;
+        let image = image.max(DVec2::ONE);
+        let mut half_angle = (Self::FOV / 2.0).to_radians();
+        if image.x < image.y {
+            half_angle = (half_angle.tan() * image.x / image.y).atan();
+        }
         Self {
             target: Point::new(size / 2.0),
-            distance_nm: 1.02 * radius / (Self::FOV / 2.0).to_radians().sin(),
+            distance_nm: 1.02 * radius / half_angle.sin(),
             yaw: 30.0,
             pitch: 25.0,
             fov: Self::FOV,
@@ -174,6 +185,40 @@ mod tests {
             "y runs down in image and volume"
         );
         assert!((axes.z_axis - DVec3::Z).length() < 1e-12);
+    }
+
+    /// Whether all corners of the volume are on a picture.
+    fn is_whole(camera: Camera, image: DVec2) -> bool {
+        let volume = volume();
+        let from_eye = camera.physical_from_eye_axes().transpose();
+        let reach = (camera.fov / 2.0).to_radians().tan() * DVec2::new(image.x / image.y, 1.0);
+        (0..8).all(|corner| {
+            let corner = DVec3::from_array([1, 2, 4].map(|bit| f64::from(corner & bit).min(1.0)));
+            let at = from_eye * (volume.size_nm() * corner - camera.eye().xyz);
+            at.z > 0.0 && (at.truncate() / at.z).abs().cmple(reach).all()
+        })
+    }
+
+    #[test]
+    fn the_whole_volume_is_framed_whatever_the_picture() {
+        for image in [[800.0, 600.0], [300.0, 300.0], [299.0, 900.0], [7.0, 400.0]] {
+            let image = DVec2::from(image);
+            for (yaw, pitch) in [(0.0, 0.0), (60.0, 0.0), (15.0, -110.0), (200.0, 40.0)] {
+                let camera = Camera::framing(&volume(), image).orbited(yaw, pitch);
+                assert!(is_whole(camera, image), "{image}");
+                assert!(
+                    image.x < image.y || camera == Camera::around(&volume()).orbited(yaw, pitch)
+                );
+            }
+        }
+        let narrow = DVec2::new(299.0, 900.0);
+        assert!(!is_whole(Camera::around(&volume()), narrow));
+        // No picture at all is none to fall out of.
+        assert!(
+            Camera::framing(&volume(), DVec2::ZERO)
+                .distance_nm
+                .is_finite()
+        );
     }
 
     #[test]

@@ -227,6 +227,12 @@ impl App {
         );
         let input = input_on(ui, &response);
         let height = f64::from(place.rect.height());
+        let home = Camera::framing(self.session.volume(), place.size.as_dvec2());
+        if self.camera == self.home {
+            // As the window is made narrower, nothing is cut off.
+            self.camera = home;
+        }
+        self.home = home;
         let camera = moved(self.camera, &input, height, self.home);
         let moving = camera != self.camera || response.dragged();
         self.camera = camera;

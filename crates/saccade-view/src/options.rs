@@ -134,7 +134,8 @@ impl ViewOptions {
 
     /// One picture of a volume.
     pub fn view(&self, volume: &Volume, size: UVec2) -> View {
-        let camera = self.camera.unwrap_or_else(|| Camera::around(volume));
+        let framing = || Camera::framing(volume, size.as_dvec2());
+        let camera = self.camera.unwrap_or_else(framing);
         View {
             background: self.background,
             mode: self.shown.drawn_mode(),
