@@ -30,9 +30,21 @@ pub enum Detail {
 }
 
 /// How much detail the levels of a channel have, from some of its bricks.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Content {
     levels: Vec<Spread>,
+    /// Finest voxels that have changed since these bricks were looked at, and before.
+    changed: [u64; 2],
+}
+
+impl Default for Content {
+    fn default() -> Self {
+        let few = u64::from(JUDGED_BRICKS) * u64::from(BRICK_EDGE).pow(3);
+        Self {
+            levels: Vec::new(),
+            changed: [0, few],
+        }
+    }
 }
 
 /// Squared differences of values.
@@ -50,6 +62,18 @@ impl Content {
     pub(crate) fn wants(&self, level: u32) -> bool {
         let known = self.levels.get(level as usize);
         known.is_none_or(|spread| spread.bricks < JUDGED_BRICKS)
+    }
+
+    /// Forgets what was seen when as many finest voxels have changed since as ever before, or half of all `whole`:
+    /// a volume that grows is looked at again and again, ever more seldom.
+    pub(crate) fn change(&mut self, voxels: u64, whole: u64) {
+        let [since, before] = &mut self.changed;
+        *since = since.saturating_add(voxels);
+        if *since >= (*before).min(whole / 2) {
+            *before = before.saturating_add(*since);
+            *since = 0;
+            self.levels.clear();
+        }
     }
 
     /// Takes a brick's values, stored with its border, little-endian, into account.
@@ -191,6 +215,32 @@ mod tests {
             assert_eq!(needed(&[(2, 32.0)]), 3);
             assert_eq!(needed(&[(0, 4.0), (2, 32.0)]), 0, "level 0 is needed");
         }
+    }
+
+    #[test]
+    fn what_has_changed_much_is_judged_anew_and_ever_more_seldom() {
+        let mut content = noted(Dtype::Uint8, &[(0, 32.0)]);
+        let judged = content.clone().levels;
+        let few = 16 * 32 * 32 * 32;
+        content.change(few - 1, 1 << 40);
+        assert_eq!(content.finest_needed(), 1, "little has changed");
+        content.change(1, 1 << 40);
+        assert_eq!((content.finest_needed(), content.wants(0)), (0, true));
+        let mut times = 0;
+        for _ in 0..1000 {
+            content.levels.clone_from(&judged);
+            content.change(few, 1 << 40);
+            times += u32::from(content.levels.is_empty());
+        }
+        assert!((7..11).contains(&times), "{times}");
+        // All of it has changed, however often it did before.
+        for _ in 0..3 {
+            content.levels.clone_from(&judged);
+            content.change(few, few);
+            assert!(content.levels.is_empty());
+        }
+        content.change(u64::MAX, u64::MAX);
+        content.change(u64::MAX, u64::MAX);
     }
 
     #[test]

@@ -486,6 +486,10 @@ impl Session {
                     self.renderer.invalidate(change.voxels);
                     self.told.clear();
                     self.forget_ranges(change.voxels);
+                    let whole = VoxelBox::of_size(self.volume().extent()).voxels();
+                    let voxels = change.voxels.voxels();
+                    let contents = self.contents.iter_mut();
+                    contents.for_each(|content| content.change(voxels, whole));
                     changed = true;
                     self.refresh.changed();
                     self.dirty = true;
