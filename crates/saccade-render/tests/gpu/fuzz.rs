@@ -15,7 +15,7 @@ use saccade_render::{
 };
 
 use crate::harness::{deliver, frame, gpu, read};
-use crate::scene::{Scene, tissue};
+use crate::scene::{Scene, stained, tissue};
 
 /// Numbers as they should be, or now and then of any size, or none.
 fn numbers(usual: std::ops::Range<f64>) -> impl Strategy<Value = f64> {
@@ -149,6 +149,8 @@ struct Met {
     seen: u32,
     /// In which a pixel that is no number would show.
     telling: u32,
+    /// With more than one channel.
+    several: u32,
 }
 
 /// What is drawn by a renderer that was used for all views before this one.
@@ -156,21 +158,23 @@ fn draw(
     renderer: &mut Renderer,
     scene: &Scene,
     view: &View,
-    channel: ChannelView,
+    channels: &[ChannelView],
     met: &mut Met,
 ) -> Result<(), TestCaseError> {
     // Whatever is drawn on white in colours that are never black is not black. What is no number is
     // stored as 0.
-    let telling = channel.transfer.color_map == ColorMap::Viridis
-        && view.heat.is_none()
-        && view.false_colors == FalseColors::None
-        // A surface of what no voxel can be has no colour.
-        && (view.mode != Mode::IsoSurface || (0.01..=1.0).contains(&channel.iso));
+    let tells = |channel: &ChannelView| {
+        channel.transfer.color_map == ColorMap::Viridis
+            // A surface of what no voxel can be has no colour.
+            && (view.mode != Mode::IsoSurface || (0.01..=1.0).contains(&channel.iso))
+    };
+    let telling =
+        view.heat.is_none() && view.false_colors == FalseColors::None && channels.iter().all(tells);
     let view = &View {
         background: if telling { [1.0; 3] } else { view.background },
         ..*view
     };
-    renderer.set_channels(&[channel]).unwrap();
+    renderer.set_channels(channels).unwrap();
     let mut rays = 0;
     for _ in 0..3 {
         let report = frame(renderer, view);
@@ -192,35 +196,44 @@ fn draw(
     met.cases += 1;
     met.seen += u32::from(rays > 0);
     met.telling += u32::from(rays > 0 && telling);
+    met.several += u32::from(rays > 0 && channels.len() > 1);
     Ok(())
 }
 
-#[test]
-fn no_view_hangs_or_breaks_anything() {
-    let Some(gpu) = gpu() else { return };
-    let scene = tissue();
+/// How a channel is drawn, whichever it is.
+fn channel() -> impl Strategy<Value = ChannelView> {
+    (transfer(), single(), 0..40_u32, 0..40_u32).prop_map(|(transfer, iso, first, coarser)| {
+        ChannelView {
+            iso,
+            levels: first / 8..=u32::MAX - coarser,
+            coarser: coarser / 8,
+            ..ChannelView::new(0, transfer)
+        }
+    })
+}
+
+/// Draws a scene by views of all kinds, each with some of its channels in some order.
+fn fuzz(scene: &Scene, cases: u32) -> Option<Met> {
+    let gpu = gpu()?;
     let options = RendererOptions {
-        memory_bytes: 6 << 20,
+        memory_bytes: scene.channels().map(|_| 6 << 20).sum(),
         ..RendererOptions::default()
     };
     let mut renderer = Renderer::new(&gpu, scene.volume.clone(), options).unwrap();
     // The same picture before and after: what came between left no trace.
     let plain = View::new(Camera::around(&scene.volume), UVec2::new(40, 30));
     let settled = |renderer: &mut Renderer| {
-        renderer.set_transfer_function(&scene.transfer);
-        crate::harness::settle(renderer, &plain, &scene);
+        renderer.set_channels(&scene.views()).unwrap();
+        crate::harness::settle(renderer, &plain, scene);
         read(renderer)
     };
     let before = settled(&mut renderer);
-    let cases = (
-        view(&scene.volume),
-        transfer(),
-        single(),
-        0..40_u32,
-        0..40_u32,
-    );
+    let all: Vec<u32> = (0..).take(scene.channels().count()).collect();
+    let count = 1..=all.len();
+    let order = (Just(all.clone()).prop_shuffle(), count);
+    let looks = prop::collection::vec(channel(), all.len());
     let config = Config {
-        cases: 96,
+        cases,
         failure_persistence: None,
         ..Config::default()
     };
@@ -228,20 +241,16 @@ fn no_view_hangs_or_breaks_anything() {
     let rng = TestRng::deterministic_rng(RngAlgorithm::ChaCha);
     let mut runner = TestRunner::new_with_rng(config, rng);
     let renderer = std::cell::RefCell::new((renderer, Met::default()));
+    let all_views = (view(&scene.volume), order, looks);
     runner
-        .run(&cases, |(view, transfer, iso, first, coarser)| {
-            let channel = ChannelView {
-                iso,
-                levels: first / 8..=u32::MAX - coarser,
-                coarser: coarser / 8,
-                ..ChannelView::new(0, transfer)
-            };
+        .run(&all_views, |(view, (order, count), looks)| {
+            let shown = order.into_iter().take(count).zip(looks);
+            let shown = shown.map(|(channel, look)| ChannelView { channel, ..look });
             let (renderer, met) = &mut *renderer.borrow_mut();
-            draw(renderer, &scene, &view, channel, met)
+            draw(renderer, scene, &view, &shown.collect::<Vec<_>>(), met)
         })
         .unwrap();
     let (mut renderer, met) = renderer.into_inner();
-    assert!(met.seen * 8 > met.cases && met.telling > 8, "{met:?}");
     for _ in 0..40 {
         // The level of detail that memory asked for falls again.
         frame(&mut renderer, &plain);
@@ -249,6 +258,22 @@ fn no_view_hangs_or_breaks_anything() {
     let after = settled(&mut renderer);
     let db = crate::harness::psnr(&before, &after);
     assert!(db > 60.0, "{db:.1} dB");
+    Some(met)
+}
+
+#[test]
+fn no_view_hangs_or_breaks_anything() {
+    if let Some(met) = fuzz(&tissue(), 96) {
+        assert!(met.seen * 8 > met.cases && met.telling > 8, "{met:?}");
+    }
+}
+
+#[test]
+fn no_view_of_several_channels_hangs_or_breaks_anything() {
+    if let Some(met) = fuzz(&stained(), 64) {
+        assert!(met.seen * 8 > met.cases && met.telling > 2, "{met:?}");
+        assert!(met.several * 4 > met.cases, "{met:?}");
+    }
 }
 
 /// Numbers that are none must not reach the picture: with a background that every value differs from, only what is drawn or
