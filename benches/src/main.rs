@@ -47,6 +47,9 @@ struct Arguments {
     /// small where a processor does.
     #[arg(long, value_enum)]
     scale: Option<Scale>,
+    /// An image for the rows of `render.image.`: a folder or address of OME-Zarr or precomputed voxels, 8 or 16 bit.
+    #[arg(long, value_name = "PLACE")]
+    image: Option<String>,
     /// Rows to measure, by id, or by the beginning of ids up to a dot; all when none is named.
     #[arg(value_name = "ID")]
     ids: Vec<String>,
@@ -62,6 +65,7 @@ fn main() -> Result<()> {
         ids: arguments.ids,
         plots: arguments.plots,
         scale: arguments.scale,
+        image: arguments.image,
     };
     let mut report = Report::new(machine::Machine::here());
     for group in wanted {

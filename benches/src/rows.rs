@@ -5,6 +5,7 @@ mod codec;
 mod construct;
 mod first_light;
 mod frame_cost;
+mod image;
 mod index;
 mod ingest;
 mod petascale;
@@ -17,6 +18,7 @@ mod table_9_1;
 mod update;
 mod versus;
 mod workers;
+mod working_set;
 mod zarr_reads;
 
 use anyhow::Result;
@@ -98,15 +100,15 @@ pub(crate) static GROUPS: &[Group] = &[
     },
     Group {
         ids: versus::DENSE_IDS,
-        measure: |_| versus::vs_dense_texture(),
+        measure: versus::vs_dense_texture,
     },
     Group {
         ids: versus::SMALL_IDS,
-        measure: |_| versus::vs_small_volume(),
+        measure: versus::vs_small_volume,
     },
     Group {
         ids: versus::PAGE_TABLES_IDS,
-        measure: |_| versus::vs_page_tables(),
+        measure: versus::vs_page_tables,
     },
     Group {
         ids: table_9_1::IDS,
@@ -115,6 +117,14 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: table_9_1::LEAF_IDS,
         measure: table_9_1::leaf_sizes,
+    },
+    Group {
+        ids: image::IDS,
+        measure: image::measure,
+    },
+    Group {
+        ids: working_set::IDS,
+        measure: working_set::measure,
     },
     Group {
         ids: petascale::TABLE_1_IDS,

@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
+use image::GrayImage;
 use saccade_render::{Gpu, wgpu};
 
 use crate::plot::Plot;
@@ -17,6 +18,8 @@ pub(crate) struct Settings {
     pub(crate) plots: Option<PathBuf>,
     /// How large the volumes and pictures of the papers' tables are; `None` is for the device to say.
     pub(crate) scale: Option<Scale>,
+    /// Folder or address of an image that is drawn, if any.
+    pub(crate) image: Option<String>,
 }
 
 /// Whether what was asked for is this row, or the beginning of its id up to a dot.
@@ -43,6 +46,16 @@ impl Settings {
             Some(folder) => plot.write(folder, name),
             None => Ok(()),
         }
+    }
+
+    /// Writes a picture as `NAME.png` where plots go.
+    pub(crate) fn picture(&self, picture: &GrayImage, name: &str) -> Result<()> {
+        let Some(folder) = &self.plots else {
+            return Ok(());
+        };
+        let file = folder.join(format!("{name}.png"));
+        std::fs::create_dir_all(folder)?;
+        { picture.save(&file) }.with_context(|| format!("cannot write {}", file.display()))
     }
 }
 

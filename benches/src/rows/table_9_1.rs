@@ -1,19 +1,22 @@
-//! \[001 table 9.1\] and \[001 fig. 9.2 to 9.4\]: the residency octree against page tables alone and against an octree,
+//! \[001 table 9.1\] and \[001 fig. 9.2 and 9.3\]: the residency octree against page tables alone and against an octree,
 //! for data sets like those of the thesis.
+
+use std::sync::Arc;
 
 use anyhow::{Result, ensure};
 use glam::{UVec2, UVec3};
 use saccade_core::camera::Camera;
-use saccade_render::{Gpu, Renderer, RendererOptions, Statistics, View, wgpu};
+use saccade_core::volume::Volume;
+use saccade_render::{ChannelView, Gpu, Renderer, RendererOptions, Statistics, View, wgpu};
 
 use crate::baselines::{Baseline, Method, Work};
-use crate::bricks::{at_once, settle};
+use crate::bricks::{Bricks, at_once, settle};
 use crate::clock::Stopwatch;
 use crate::cpu;
 use crate::plot::{Axis, Plot};
 use crate::report::Row;
 use crate::settings::Settings;
-use crate::volumes::{Case, DataSet, Scale};
+use crate::volumes::{Case, DataSet, Formula, Scale};
 
 pub(crate) const IDS: &[&str] = &[
     "render.aneurism_1ch.vs_page_tables",
@@ -75,7 +78,7 @@ const TABLE: [Cells; 9] = [
 ];
 
 /// Bytes for bricks, of ours and of each baseline.
-fn cache_bytes(scale: Scale) -> u64 {
+pub(crate) fn cache_bytes(scale: Scale) -> u64 {
     match scale {
         Scale::Small => 256 << 20,
         Scale::Medium => 1 << 30,
@@ -146,10 +149,27 @@ impl Drawn {
     }
 }
 
+/// What is drawn by each.
+pub(crate) struct Subject<'a, B> {
+    pub(crate) volume: &'a Arc<Volume>,
+    pub(crate) bricks: &'a B,
+    pub(crate) channels: &'a [ChannelView],
+}
+
+impl<'a> From<&'a Case> for Subject<'a, Formula> {
+    fn from(case: &'a Case) -> Self {
+        Self {
+            volume: &case.formula.volume,
+            bricks: &case.formula,
+            channels: &case.views,
+        }
+    }
+}
+
 /// Ours, everything that the views need resident, and what its rays do in the first of them.
 fn ours(
     gpu: &Gpu,
-    case: &Case,
+    subject: &Subject<'_, impl Bricks + Sync>,
     views: &[View],
     scale: Scale,
     leaf: Option<UVec3>,
@@ -159,43 +179,43 @@ fn ours(
         octree_cell: leaf,
         ..at_once()
     };
-    let mut renderer = Renderer::new(gpu, case.formula.volume.clone(), options)?;
-    renderer.set_channels(&case.views)?;
+    let mut renderer = Renderer::new(gpu, subject.volume.clone(), options)?;
+    renderer.set_channels(subject.channels)?;
     for view in views {
-        settle(&mut renderer, view, &case.formula)?;
+        settle(&mut renderer, view, subject.bricks)?;
     }
-    let first = settle(&mut renderer, &views[0], &case.formula)?;
+    let first = settle(&mut renderer, &views[0], subject.bricks)?;
     ensure!(first.memory_bias == 0.0, "the bricks did not fit");
     Ok((Drawn::Ours(Box::new(renderer)), first.statistics))
 }
 
 fn baseline(
     gpu: &Gpu,
-    case: &Case,
+    subject: &Subject<'_, impl Bricks + Sync>,
     views: &[View],
     scale: Scale,
     method: Method,
 ) -> Result<(Drawn, Work)> {
-    let volume = &case.formula.volume;
+    let volume = subject.volume;
     // As published: entered at the third level from the top.
     let top = u32::try_from(volume.levels.len().saturating_sub(3))?;
     let bytes = cache_bytes(scale);
-    let mut baseline = Baseline::new(gpu, volume, &case.views, method, top, bytes)?;
+    let mut baseline = Baseline::new(gpu, volume, subject.channels, method, top, bytes)?;
     for view in views {
-        baseline.settle(view, &case.formula)?;
+        baseline.settle(view, subject.bricks)?;
     }
-    let work = baseline.settle(&views[0], &case.formula)?;
+    let work = baseline.settle(&views[0], subject.bricks)?;
     Ok((Drawn::Baseline(Box::new(baseline)), work))
 }
 
 /// Views from around a volume.
-fn views(case: &Case, scale: Scale) -> Vec<View> {
+pub(crate) fn views(volume: &Volume, scale: Scale) -> Vec<View> {
     let (count, size) = match scale {
         Scale::Small => (1, UVec2::new(80, 60)),
         Scale::Medium => (2, UVec2::new(160, 120)),
         Scale::Paper => (8, UVec2::new(1024, 768)),
     };
-    let camera = Camera::around(&case.formula.volume).zoomed(1.3);
+    let camera = Camera::around(volume).zoomed(1.3);
     let turned = (0..count).map(|n| View {
         lod_bias: -20.0,
         ..View::new(
@@ -240,78 +260,89 @@ pub(crate) fn measure(settings: &Settings) -> Result<Vec<Row>> {
         }
         eprintln!("  {set:?}, {channels} channels ...");
         let case = set.case(scale, channels)?;
-        let views = views(&case, scale);
-        let (ours, statistics) = ours(gpu, &case, &views, scale, None)?;
-        let mut drawn = vec![ours];
-        let mut works = Vec::new();
-        for method in Method::ALL {
-            let (baseline, work) = baseline(gpu, &case, &views, scale, method)?;
-            drawn.push(baseline);
-            works.push(work);
-        }
-        let times = times(&mut drawn, &views)?;
-        let [
-            ours,
-            tables,
-            hiding,
-            restart,
-            stack,
-            sampled_tables,
-            sampled_octree,
-        ] = &times[..]
-        else {
-            unreachable!("ours and six baselines");
-        };
-        let extent = case.formula.volume.extent();
-        let row = |id, theirs: &[f64], published: f64, work: &Work| {
-            Row::new(id, "theirs over ours", ratios(theirs, ours))
-                .peer(published, "Herzberger 2023, table 9.1, GTX 1080")
-                .setting(
-                    "picture",
-                    format!("{}x{}", views[0].size.x, views[0].size.y),
-                )
-                .setting(
-                    "volume",
-                    format!("{} x {} x {} voxels", extent.x, extent.y, extent.z),
-                )
-                .setting("channels", channels)
-                .setting("time", time_of(gpu))
-                .setting("views", views.len())
-                .setting("ours_ms", mean(ours))
-                .setting("theirs_ms", mean(theirs))
-                .setting("ours samples", statistics.samples)
-                .setting("ours bricks", statistics.bricks_used)
-                .setting("theirs samples", work.samples)
-                .setting("theirs bricks", work.bricks)
-        };
         let [pt, octree, residency] = published;
-        let (pt, octree) = (pt / residency, octree / residency);
-        rows.push(
-            row(ids[0], tables, pt, &works[0])
-                .setting("theirs", "page tables that skip bricks of zeros")
-                .setting(
-                    "skipping what is hidden too, over ours",
-                    mean(hiding) / mean(ours),
-                ),
-        );
-        rows.push(
-            row(ids[1], stack, octree, &works[3])
-                .setting("theirs", "an octree of bricks, four nodes remembered")
-                .setting(
-                    "entered at the top each time, over ours",
-                    mean(restart) / mean(ours),
-                ),
-        );
-        rows.push(row(ids[2], sampled_tables, pt, &works[4]).setting(
-            "theirs",
-            "page tables that skip bricks of zeros, looked up at every sample, as published",
-        ));
-        rows.push(row(ids[3], sampled_octree, octree, &works[5]).setting(
-            "theirs",
-            "an octree of bricks, searched at every sample of every channel, as published",
-        ));
+        let published = [pt / residency, octree / residency];
+        let cells = beside_baselines(gpu, &Subject::from(&case), scale, ids)?;
+        rows.extend(cells.into_iter().zip([0, 1, 0, 1]).map(|(row, against)| {
+            let peer = "Herzberger 2023, table 9.1, GTX 1080";
+            row.peer(published[against], peer)
+        }));
     }
     Ok(rows)
+}
+
+/// Four rows: against page tables and an octree, both strong, and both as published.
+pub(crate) fn beside_baselines(
+    gpu: &Gpu,
+    subject: &Subject<'_, impl Bricks + Sync>,
+    scale: Scale,
+    ids: &[&'static str],
+) -> Result<Vec<Row>> {
+    let views = views(subject.volume, scale);
+    let (ours, statistics) = ours(gpu, subject, &views, scale, None)?;
+    let mut drawn = vec![ours];
+    let mut works = Vec::new();
+    for method in Method::ALL {
+        let (baseline, work) = baseline(gpu, subject, &views, scale, method)?;
+        drawn.push(baseline);
+        works.push(work);
+    }
+    let times = times(&mut drawn, &views)?;
+    let [
+        ours,
+        tables,
+        hiding,
+        restart,
+        stack,
+        sampled_tables,
+        sampled_octree,
+    ] = &times[..]
+    else {
+        unreachable!("ours and six baselines");
+    };
+    let extent = subject.volume.extent();
+    let row = |id, theirs: &[f64], work: &Work| {
+        Row::new(id, "theirs over ours", ratios(theirs, ours))
+            .setting(
+                "picture",
+                format!("{}x{}", views[0].size.x, views[0].size.y),
+            )
+            .setting(
+                "volume",
+                format!("{} x {} x {} voxels", extent.x, extent.y, extent.z),
+            )
+            .setting("channels", subject.channels.len())
+            .setting("time", time_of(gpu))
+            .setting("views", views.len())
+            .setting("ours_ms", mean(ours))
+            .setting("theirs_ms", mean(theirs))
+            .setting("ours samples", statistics.samples)
+            .setting("ours bricks", statistics.bricks_used)
+            .setting("theirs samples", work.samples)
+            .setting("theirs bricks", work.bricks)
+    };
+    Ok(vec![
+        row(ids[0], tables, &works[0])
+            .setting("theirs", "page tables that skip bricks of zeros")
+            .setting(
+                "skipping what is hidden too, over ours",
+                mean(hiding) / mean(ours),
+            ),
+        row(ids[1], stack, &works[3])
+            .setting("theirs", "an octree of bricks, four nodes remembered")
+            .setting(
+                "entered at the top each time, over ours",
+                mean(restart) / mean(ours),
+            ),
+        row(ids[2], sampled_tables, &works[4]).setting(
+            "theirs",
+            "page tables that skip bricks of zeros, looked up at every sample, as published",
+        ),
+        row(ids[3], sampled_octree, &works[5]).setting(
+            "theirs",
+            "an octree of bricks, searched at every sample of every channel, as published",
+        ),
+    ])
 }
 
 /// What leaf sizes are drawn beside.
@@ -356,14 +387,15 @@ pub(crate) fn leaf_sizes(settings: &Settings) -> Result<Vec<Row>> {
         for &channels in counts {
             eprintln!("  {set:?}, {channels} channels ...");
             let case = set.case(scale, channels)?;
-            let views = views(&case, scale);
+            let subject = Subject::from(&case);
+            let views = views(subject.volume, scale);
             let views = &views[..views.len().min(2)];
             let mut drawn = Vec::new();
             for (_, leaf) in leaves {
-                drawn.push(ours(gpu, &case, views, scale, Some(leaf))?.0);
+                drawn.push(ours(gpu, &subject, views, scale, Some(leaf))?.0);
             }
             for (_, method) in BESIDE {
-                drawn.push(baseline(gpu, &case, views, scale, method)?.0);
+                drawn.push(baseline(gpu, &subject, views, scale, method)?.0);
             }
             let times = times(&mut drawn, views)?;
             for (line, times) in lines.iter_mut().zip(&times) {

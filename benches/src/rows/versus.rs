@@ -15,6 +15,8 @@ use saccade_render::{Gpu, Renderer, RendererOptions, Traversal, View};
 use crate::bricks::{Arrays, Bricks, at_once, frame_ms, ramp, settle};
 use crate::dense::Dense;
 use crate::report::Row;
+use crate::settings::Settings;
+use crate::volumes::Scale;
 
 pub(crate) const DENSE_IDS: &[&str] = &["render.vs_dense_texture"];
 pub(crate) const SMALL_IDS: &[&str] = &["render.888pb_vs_8gb"];
@@ -23,9 +25,26 @@ pub(crate) const PAGE_TABLES_IDS: &[&str] = &[
     "render.kingsnake_1ch.samples_vs_page_tables",
 ];
 
-/// Small enough for drivers that draw on the CPU.
-const SIZE: UVec2 = UVec2::new(160, 120);
 const RUNS: usize = 9;
+
+/// The picture, and how many times as long the edges of volumes are as where a processor draws.
+fn sizes(scale: Scale) -> (UVec2, u32) {
+    match scale {
+        Scale::Small => (UVec2::new(160, 120), 1),
+        Scale::Medium => (UVec2::new(400, 300), 2),
+        Scale::Paper => (UVec2::new(1024, 768), 4),
+    }
+}
+
+/// Room for all voxels of so large a volume, its coarser levels and the octree.
+fn room_for(extent: UVec3) -> RendererOptions {
+    let options = at_once();
+    let voxels = VoxelBox::of_size(extent).voxels();
+    RendererOptions {
+        memory_bytes: options.memory_bytes.max(3 * voxels),
+        ..options
+    }
+}
 
 /// Ratios of pairs that were measured one right after the other.
 fn ratios(mut ours: impl FnMut() -> f64, mut theirs: impl FnMut() -> f64) -> [Vec<f64>; 3] {
@@ -58,9 +77,10 @@ fn renderer(
 }
 
 /// The price of virtual memory: dense tissue, nothing to skip, everything at level 0.
-pub(crate) fn vs_dense_texture() -> Result<Vec<Row>> {
+pub(crate) fn vs_dense_texture(settings: &Settings) -> Result<Vec<Row>> {
     let gpu = &pollster::block_on(Gpu::headless())?;
-    let extent = UVec3::new(192, 192, 48);
+    let (size, edge) = sizes(settings.scale(gpu));
+    let extent = UVec3::new(192, 192, 48) * edge;
     let voxel_nm = DVec3::new(4.0, 4.0, 16.0);
     let phantom = Phantom::new(1, voxel_nm)?;
     let mut sampler = phantom.sampler();
@@ -73,9 +93,9 @@ pub(crate) fn vs_dense_texture() -> Result<Vec<Row>> {
     let transfer = ramp(0.0, 1.0, 0.3, 100.0);
     let view = View {
         lod_bias: -20.0,
-        ..View::new(Camera::around(&arrays.volume).zoomed(1.3), SIZE)
+        ..View::new(Camera::around(&arrays.volume).zoomed(1.3), size)
     };
-    let options = at_once();
+    let options = room_for(extent);
     let (mut ours, statistics) = renderer(gpu, &arrays.volume, options, &view, &arrays, &transfer)?;
     let tables = RendererOptions {
         traversal: Traversal::PageTables,
@@ -87,7 +107,7 @@ pub(crate) fn vs_dense_texture() -> Result<Vec<Row>> {
     dense.frame_ms();
     let [ratios, ours, theirs] = ratios(|| frame_ms(&mut ours, &view), || dense.frame_ms());
     let row = Row::new("render.vs_dense_texture", "ours over theirs", ratios)
-        .setting("picture", format!("{}x{}", SIZE.x, SIZE.y))
+        .setting("picture", format!("{}x{}", size.x, size.y))
         .setting(
             "volume",
             format!("{} x {} x {} voxels, tissue", extent.x, extent.y, extent.z),
@@ -134,8 +154,10 @@ impl Bricks for Island {
 }
 
 /// The same box and view in a volume of 888 PB and in one of 8 GB.
-pub(crate) fn vs_small_volume() -> Result<Vec<Row>> {
+pub(crate) fn vs_small_volume(settings: &Settings) -> Result<Vec<Row>> {
     let gpu = &pollster::block_on(Gpu::headless())?;
+    let (size, _) = sizes(settings.scale(gpu));
+    let size = size / 2;
     let voxel_nm = DVec3::new(5.0, 5.0, 40.0);
     let transfer = ramp(0.3, 0.8, 0.7, 40.0);
     let places = [
@@ -160,7 +182,7 @@ pub(crate) fn vs_small_volume() -> Result<Vec<Row>> {
             distance_nm: 1_000.0,
             ..Camera::around(&volume)
         };
-        let view = View::new(camera, SIZE / 2);
+        let view = View::new(camera, size);
         let options = at_once();
         let (renderer, _) = renderer(gpu, &volume, options, &view, &island, &transfer)?;
         anyhow::Ok((renderer, view))
@@ -173,7 +195,7 @@ pub(crate) fn vs_small_volume() -> Result<Vec<Row>> {
         || frame_ms(&mut small, &small_view),
     );
     let row = Row::new("render.888pb_vs_8gb", "large over small", ratios)
-        .setting("picture", format!("{}x{}", SIZE.x / 2, SIZE.y / 2))
+        .setting("picture", format!("{}x{}", size.x, size.y))
         .setting(
             "volumes",
             "2,000,000 x 2,000,000 x 250,000 and 4,096 x 4,096 x 512 voxels",
@@ -213,19 +235,20 @@ fn snake(extent: UVec3) -> impl Fn(UVec3) -> u8 {
     }
 }
 
-pub(crate) fn vs_page_tables() -> Result<Vec<Row>> {
+pub(crate) fn vs_page_tables(settings: &Settings) -> Result<Vec<Row>> {
     let gpu = &pollster::block_on(Gpu::headless())?;
-    let extent = UVec3::new(256, 256, 192);
+    let (size, edge) = sizes(settings.scale(gpu));
+    let extent = UVec3::new(256, 256, 192) * edge;
     let arrays = Arrays::new(extent, DVec3::splat(1000.0), snake(extent))?;
     let transfer = ramp(0.55, 0.7, 0.9, 1000.0);
     let view = View {
         lod_bias: -20.0,
-        ..View::new(Camera::around(&arrays.volume).zoomed(1.2), SIZE)
+        ..View::new(Camera::around(&arrays.volume).zoomed(1.2), size)
     };
     let prepare = |traversal| {
         let options = RendererOptions {
             traversal,
-            ..at_once()
+            ..room_for(extent)
         };
         renderer(gpu, &arrays.volume, options, &view, &arrays, &transfer)
     };
@@ -238,7 +261,7 @@ pub(crate) fn vs_page_tables() -> Result<Vec<Row>> {
     );
     let row = |id, runs| {
         Row::new(id, "theirs over ours", runs)
-            .setting("picture", format!("{}x{}", SIZE.x, SIZE.y))
+            .setting("picture", format!("{}x{}", size.x, size.y))
             .setting(
                 "volume",
                 format!(
