@@ -59,6 +59,8 @@ pub(crate) struct Baseline {
     looks: Looks,
     report: wgpu::Buffer,
     loaded: Vec<BrickId>,
+    /// What each slot holds.
+    slots: Vec<BrickId>,
     usage_words: usize,
     /// Index, blocks, ranges, as of the last upload.
     on_device: Option<[wgpu::Buffer; 3]>,
@@ -160,6 +162,7 @@ impl Baseline {
             looks: Looks::new(gpu, views, volume.dtype),
             report,
             loaded: Vec::new(),
+            slots: Vec::new(),
             usage_words,
             on_device: None,
             image: None,
@@ -180,6 +183,18 @@ impl Baseline {
     pub(crate) fn set_views(&mut self, views: &[ChannelView]) {
         let looks = Looks::new(&self.gpu, views, self.volume.dtype);
         (self.looks, self.views) = (looks, views.to_vec());
+    }
+
+    /// Bricks that the rays of a view need to be there, all of which are loaded.
+    pub(crate) fn needed(&mut self, view: &View) -> Result<Vec<BrickId>> {
+        self.draw(view, true, 1)?;
+        let words = read_buffer(&self.gpu, &self.report)?;
+        ensure!(self.missed(&words)?.is_empty(), "the view is not settled");
+        let used = &words[COUNTERS..COUNTERS + self.usage_words];
+        let is_used = |slot: usize| (used[slot / 32] >> (slot % 32)) & 1 == 1;
+        let slots = self.slots.iter().enumerate();
+        let used = slots.filter(|(slot, _)| is_used(*slot));
+        Ok(used.map(|(_, id)| *id).collect())
     }
 
     /// Loads what a view needs, and tells what its rays do then.
@@ -241,6 +256,7 @@ impl Baseline {
                         let slot = u32::try_from(self.paged.ranges.len())?;
                         ensure!(slot < self.grid.element_product(), "the bricks do not fit");
                         self.write(slot, &voxels);
+                        self.slots.push(id);
                         self.paged.insert(id, Some((slot, [low, high])));
                     }
                     _ => self.paged.insert(id, None),
@@ -422,7 +438,8 @@ fn first_level(views: &[ChannelView], most: u32) -> u32 {
     first.unwrap_or(0).min(most)
 }
 
-fn range(voxels: &[u8], dtype: Dtype) -> [u16; 2] {
+/// Smallest and largest value of a brick.
+pub(crate) fn range(voxels: &[u8], dtype: Dtype) -> [u16; 2] {
     let of = |values: &mut dyn Iterator<Item = u16>| {
         values.fold([u16::MAX, 0], |[low, high], v| [low.min(v), high.max(v)])
     };

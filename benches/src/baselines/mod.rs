@@ -4,7 +4,7 @@ mod caster;
 mod paged;
 mod table;
 
-pub(crate) use caster::{Baseline, Work};
+pub(crate) use caster::{Baseline, Work, range};
 
 /// How rays find bricks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

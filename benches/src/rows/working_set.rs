@@ -1,19 +1,21 @@
 //! \[001 fig. 9.4\]: how many bricks have to be resident for each pixel, with page tables, an octree and the residency
 //! octree.
 
-use anyhow::{Result, ensure};
+use std::collections::HashSet;
+
+use anyhow::{Context as _, Result, bail, ensure};
 use glam::{DMat3, DVec2, DVec3, UVec2};
 use image::{GrayImage, Luma};
 use saccade_core::brick::{BRICK_EDGE, BrickId};
 use saccade_core::volume::Volume;
-use saccade_render::{Gpu, Renderer, RendererOptions, View};
+use saccade_render::{BrickVoxels, Gpu, Renderer, RendererOptions, View};
 
 use super::table_9_1::{cache_bytes, views};
-use crate::baselines::{Baseline, Method};
-use crate::bricks::{at_once, settle_loading};
+use crate::baselines::{Baseline, Method, range};
+use crate::bricks::{all_bricks, at_once};
 use crate::report::Row;
 use crate::settings::Settings;
-use crate::volumes::DataSet;
+use crate::volumes::{DataSet, Formula};
 
 pub(crate) const IDS: &[&str] = &[
     "render.kingsnake_1ch.working_set_of_page_tables",
@@ -33,17 +35,16 @@ pub(crate) fn measure(settings: &Settings) -> Result<Vec<Row>> {
     };
     let mut renderer = Renderer::new(gpu, volume.clone(), options)?;
     renderer.set_channels(&case.views)?;
-    let (report, ours) = settle_loading(&mut renderer, &view, &case.formula)?;
-    ensure!(report.memory_bias == 0.0, "the bricks did not fit");
-    let loaded_by = |method| {
+    let ours = needed(&mut renderer, &view, &case.formula)?;
+    let needed_by = |method| {
         let top = u32::try_from(volume.levels.len().saturating_sub(3))?;
         let bytes = cache_bytes(scale);
         let mut baseline = Baseline::new(gpu, volume, &case.views, method, top, bytes)?;
         baseline.settle(&view, &case.formula)?;
-        anyhow::Ok(baseline.loaded().to_vec())
+        baseline.needed(&view)
     };
-    let tables = loaded_by(Method::PageTables)?;
-    let octree = loaded_by(Method::ShortStack)?;
+    let tables = needed_by(Method::PageTables)?;
+    let octree = needed_by(Method::ShortStack)?;
     let counts = [&tables, &octree, &ours].map(|ids| bricks_by_pixel(volume, &view, ids));
     let most = counts.iter().flatten().copied().max().unwrap_or(0);
     settings.picture(&side_by_side(&counts, view.size, most), "fig_9_4")?;
@@ -69,6 +70,35 @@ pub(crate) fn measure(settings: &Settings) -> Result<Vec<Row>> {
         row(IDS[0], of_tables, tables.len()),
         row(IDS[1], of_octree, octree.len()),
     ])
+}
+
+/// Bricks that are delivered for a view by a source that knows values of all before they are read, as stitched ones do.
+fn needed(renderer: &mut Renderer, view: &View, source: &Formula) -> Result<Vec<BrickId>> {
+    let mut delivered = Vec::new();
+    let mut told = HashSet::new();
+    for _ in 0..2_000 {
+        renderer.render(view);
+        let report = pollster::block_on(renderer.finish()).pop();
+        let report = report.context("a frame without a report")?;
+        if report.is_complete() && !report.redraw {
+            ensure!(report.memory_bias == 0.0, "the bricks did not fit");
+            return Ok(delivered);
+        }
+        for (&id, voxels) in { report.misses.iter() }.zip(all_bricks(source, &report.misses)) {
+            let Some(voxels) = voxels else {
+                renderer.deliver(id, BrickVoxels::Empty)?;
+                continue;
+            };
+            let values = range(&voxels, source.volume.dtype);
+            // What is missed again by a frame that knows is needed.
+            if told.insert(id) && renderer.note_range(id, values) {
+                continue;
+            }
+            renderer.deliver(id, BrickVoxels::Voxels(&voxels))?;
+            delivered.push(id);
+        }
+    }
+    bail!("the view does not settle")
 }
 
 /// Through how many of these bricks the ray of each pixel goes, row by row.
