@@ -17,7 +17,9 @@ mod memory;
 mod name;
 mod object;
 
-pub use disk::{Crash, DirEntry, Disk, FolderId, Metadata, OpenFile, SimulatedDisk, SystemDisk};
+pub use disk::{
+    Crash, DirEntry, Disk, FolderId, Metadata, OpenFile, SimulatedDisk, SystemDisk, write_whole,
+};
 pub use error::StorageError;
 pub use faulty::{FaultyStorage, ReadFault, WriteFault};
 pub use local::LocalStorage;

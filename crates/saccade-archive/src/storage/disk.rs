@@ -138,6 +138,44 @@ pub struct DirEntry {
     pub is_dir: bool,
 }
 
+/// Writes a file into a folder that exists, whole: whenever the power is cut, the path has what it had before, or this; once
+/// it returns, this.
+///
+/// # Errors
+///
+/// What the system says.
+pub fn write_whole(disk: &dyn Disk, path: &Path, bytes: &[u8]) -> io::Result<()> {
+    use io::ErrorKind::{InvalidInput, NotFound, Unsupported};
+    // Its own: another may be about to write the same.
+    let mut part = path.as_os_str().to_owned();
+    part.push(format!(".{}.part", std::process::id()));
+    let part = Path::new(&part);
+    // Of one who died.
+    match disk.remove_file(part) {
+        Err(e) if e.kind() != NotFound => return Err(e),
+        Ok(()) | Err(_) => {}
+    }
+    let write = || {
+        let mut file = disk.create_new(part)?;
+        file.write_all(bytes)?;
+        file.sync()?;
+        drop(file);
+        disk.rename(part, path)
+    };
+    write().inspect_err(|_| {
+        // Without this a full disk would stay full; a failure here changes nothing.
+        let _ = disk.remove_file(part);
+    })?;
+    let folder = path
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty());
+    match disk.sync_dir(folder.unwrap_or(Path::new("."))) {
+        // Some shares know no such thing.
+        Err(e) if matches!(e.kind(), InvalidInput | Unsupported) => Ok(()),
+        synced => synced,
+    }
+}
+
 /// The operating system's file systems.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SystemDisk;
@@ -221,5 +259,43 @@ impl Disk for SystemDisk {
             .map_err(|_| io::ErrorKind::OutOfMemory)?;
         file.take(len).read_to_end(&mut bytes)?;
         Ok(bytes.into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn after_a_power_cut_a_file_is_the_old_one_or_the_new_one() {
+        let path = Path::new("kept/volume.json");
+        let (old, new) = (vec![1; 700], vec![2; 1900]);
+        let (mut olds, mut news, mut cuts) = (0, 0, 0);
+        for cut in 0.. {
+            let disk = SimulatedDisk::new();
+            disk.create_dir(Path::new("kept")).unwrap();
+            disk.sync_dir(Path::new("")).unwrap();
+            write_whole(&disk, path, &old).unwrap();
+            disk.cut_power_at(cut);
+            let written = write_whole(&disk, path, &new);
+            for seed in 0..200 {
+                let left = disk.after_crash(&mut Crash::new(seed));
+                let read = left.read(path, None).unwrap();
+                assert!(read == old || read == new, "{} bytes", read.len());
+                assert!(written.is_err() || read == new, "it was acknowledged");
+                (olds, news) = (olds + u32::from(read == old), news + u32::from(read == new));
+                // What is left in its way is no obstacle.
+                write_whole(&left, path, &old).unwrap();
+                assert_eq!(left.read(path, None).unwrap(), old);
+            }
+            cuts += 1;
+            if written.is_ok() {
+                break;
+            }
+        }
+        assert!(
+            cuts > 4 && olds > 0 && news > 200,
+            "{cuts} cuts, {olds}, {news}"
+        );
     }
 }
