@@ -20,6 +20,7 @@
 
 mod key;
 mod record;
+mod text;
 pub mod tile_configuration;
 pub mod tile_list;
 pub mod tile_specs;
@@ -33,6 +34,10 @@ use std::path::{Component, Path, PathBuf};
 use glam::{DVec3, UVec3};
 use saccade_core::volume::{Dtype, Volume, VolumeError, VoxelKind};
 use serde::{Deserialize, Serialize};
+
+use crate::storage::{SystemDisk, write_whole};
+
+pub use text::readable;
 
 pub use record::{
     BrokenRecord, ChannelRef, Cursor, DeleteRecord, Record, RecordLine, RecordReader, RecordWriter,
@@ -144,6 +149,15 @@ pub enum AcquisitionError {
         /// File.
         path: PathBuf,
     },
+    /// A text is in another encoding than all others.
+    #[error(
+        "this text is UTF-16, which editors of Windows call \"Unicode\"; save it as UTF-8: {}",
+        path.display()
+    )]
+    Utf16 {
+        /// File.
+        path: PathBuf,
+    },
     /// A line of a text file makes no sense.
     #[error("line {line}: {reason}: {}", path.display())]
     Line {
@@ -230,8 +244,8 @@ impl AcquisitionInfo {
     ///
     /// # Errors
     ///
-    /// [`AcquisitionError::NoInfo`], [`AcquisitionError::Read`], [`AcquisitionError::LeadsOut`], and
-    /// [`AcquisitionError::Info`], [`AcquisitionError::Key`] or [`AcquisitionError::Channels`] for what it says.
+    /// [`AcquisitionError::NoInfo`], [`AcquisitionError::Read`], [`AcquisitionError::LeadsOut`],
+    /// [`AcquisitionError::Utf16`], and [`AcquisitionError::Info`], [`AcquisitionError::Key`] or [`AcquisitionError::Channels`] for what it says.
     pub fn read(folder: &Path) -> Result<Self, AcquisitionError> {
         let path = folder.join(Self::FILE);
         // The folder first: "you may not look in here" is not "there is nothing here".
@@ -249,10 +263,11 @@ impl AcquisitionInfo {
             }
             Err(source) => return Err(AcquisitionError::Read { source, path }),
         };
-        if let Some((key, meant)) = key::misspelt(&text, &key::KNOWN) {
+        let text = text::content(&text, &path)?;
+        if let Some((key, meant)) = key::misspelt(text, &key::KNOWN) {
             return Err(AcquisitionError::Key { key, meant, path });
         }
-        let info: Self = match serde_json::from_slice(&text) {
+        let info: Self = match serde_json::from_slice(text) {
             Ok(info) => info,
             Err(source) => return Err(AcquisitionError::Info { source, path }),
         };
@@ -287,11 +302,9 @@ impl AcquisitionInfo {
     /// [`AcquisitionError::Write`].
     pub fn write(&self, folder: &Path) -> Result<(), AcquisitionError> {
         let path = folder.join(Self::FILE);
-        let temporary = folder.join(concat!("volume.json", ".part"));
         let text = serde_json::to_vec_pretty(self).expect("numbers and a string become JSON");
         fs::create_dir_all(folder)
-            .and_then(|()| fs::write(&temporary, text))
-            .and_then(|()| fs::rename(&temporary, &path))
+            .and_then(|()| write_whole(&SystemDisk, &path, &text))
             .map_err(|source| AcquisitionError::Write { source, path })
     }
 
@@ -320,7 +333,11 @@ fn stays_below(path: &Path, folder: &Path) -> bool {
 }
 
 /// Refuses a file that is a link out of its folder.
-fn refuse_link_out(path: &Path) -> Result<(), AcquisitionError> {
+///
+/// # Errors
+///
+/// [`AcquisitionError::LeadsOut`].
+pub fn refuse_link_out(path: &Path) -> Result<(), AcquisitionError> {
     let is_link = fs::symlink_metadata(path).is_ok_and(|meta| meta.is_symlink());
     let folder = path.parent().filter(|_| is_link);
     if folder.is_some_and(|folder| !stays_below(path, folder)) {
@@ -383,6 +400,47 @@ mod tests {
             assert!(moved < 800.0, "{} moved by {moved}", tile.name());
         }
         assert_eq!(list[0].corner, glam::DVec2::new(0.0, 5142.0));
+    }
+
+    #[test]
+    fn a_mark_is_passed_over_and_utf16_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("text");
+        let json = r#"[{"tileId": "t", "z": 0, "width": 9, "height": 9,
+            "mipmapLevels": {"0": {"imageUrl": "a.tif"}}, "transforms": {"specList": []}}]"#;
+        let xml = r#"<trakem2><t2_layer z="0"><t2_patch width="9" height="7" transform="matrix(1,0,0,1,0,0)"
+            file_path="a.tif"/></t2_layer></trakem2>"#;
+        type Read = fn(&Path) -> Result<usize, AcquisitionError>;
+        let kinds: [(&str, Read); 4] = [
+            ("a.tif 1 2 3\n", |p| tile_list::read(p).map(|all| all.len())),
+            ("dim = 2\na.tif; ; (1, 2)\n", |p| {
+                tile_configuration::read(p).map(|all| all.len())
+            }),
+            (json, |p| tile_specs::read(p).map(|all| all.len())),
+            (xml, |p| trakem2::read(p).map(|all| all.len())),
+        ];
+        for (text, read) in kinds {
+            fs::write(&path, format!("\u{feff}{text}")).unwrap();
+            assert_eq!(read(&path).unwrap(), 1, "{text}");
+            let wide = "\u{feff}".encode_utf16().chain(text.encode_utf16());
+            fs::write(&path, wide.flat_map(u16::to_le_bytes).collect::<Vec<_>>()).unwrap();
+            let refused = read(&path).unwrap_err().to_string();
+            assert!(
+                refused.contains("UTF-16") && refused.contains("save it as UTF-8"),
+                "{refused}"
+            );
+        }
+        fs::write(
+            &path,
+            format!("ok.tif 1 2 3\n{} 1 2\n", "a".repeat(30 << 20)),
+        )
+        .unwrap();
+        let refused = tile_list::read(&path).unwrap_err().to_string();
+        assert!(
+            refused.len() < 1000 && refused.contains("line 2"),
+            "{}",
+            refused.len()
+        );
     }
 
     #[test]

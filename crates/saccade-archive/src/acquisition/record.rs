@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::key;
+use super::text::{cut, is_utf16};
 pub use reader::{Cursor, RecordLine, RecordReader};
 pub use writer::RecordWriter;
 
@@ -163,9 +164,10 @@ fn parse(text: &[u8]) -> Result<Record, String> {
             None => Ok(Record::Tile(tile)),
         },
         Ok(record) => Ok(record),
+        Err(_) if is_utf16(text) => Err("it is UTF-16; write it as UTF-8".to_owned()),
         Err(error) => Err(match hint(text, &KEYS) {
-            Some(hint) => format!("{error}; {hint}"),
-            None => error.to_string(),
+            Some(hint) => format!("{}; {hint}", cut(&error.to_string())),
+            None => cut(&error.to_string()),
         }),
     }
 }

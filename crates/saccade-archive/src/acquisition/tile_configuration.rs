@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec2;
 
 use super::AcquisitionError;
+use super::text::{content, quoted};
 use super::tile_list::ListedTile;
 
 /// Reads a tile configuration. With `dim = 3`, z is the section, and a whole number; with `dim = 2`
@@ -16,8 +17,8 @@ use super::tile_list::ListedTile;
 ///
 /// # Errors
 ///
-/// [`AcquisitionError::Read`]; [`AcquisitionError::Line`] for the first line that makes no sense,
-/// for a file without `dim`, and for files that hold several tiles each.
+/// [`AcquisitionError::Read`]; [`AcquisitionError::Utf16`]; [`AcquisitionError::Line`] for the first line that makes
+/// no sense, for a file without `dim`, and for files that hold several tiles each.
 pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
     let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
         source,
@@ -32,7 +33,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
 ///
 /// As [`read`], but for reading.
 pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
-    let text = String::from_utf8_lossy(bytes);
+    let text = String::from_utf8_lossy(content(bytes, path)?);
     let (mut dimensions, mut tiles, mut last) = (None, Vec::new(), 0);
     let wrong = |line, reason| AcquisitionError::Line {
         line,
@@ -49,7 +50,9 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionEr
             match (name, value) {
                 ("dim", "2") => dimensions = Some(2),
                 ("dim", "3") => dimensions = Some(3),
-                ("dim", _) => return Err(wrong(line, format!("dim is {value:?}, not 2 or 3"))),
+                ("dim", _) => {
+                    return Err(wrong(line, format!("dim is {}, not 2 or 3", quoted(value))));
+                }
                 ("multiseries", "true") => {
                     let reason = "files of several tiles cannot be read; write each tile into a \
                                   file of its own";
@@ -88,7 +91,7 @@ fn setting(text: &str) -> Option<(&str, &str)> {
 }
 
 fn tile(text: &str, dimensions: usize) -> Result<ListedTile, String> {
-    let form = || format!("{text:?} is not `file; ; (x, y)`");
+    let form = || format!("{} is not `file; ; (x, y)`", quoted(text));
     let (rest, position) = text.rsplit_once(';').ok_or_else(form)?;
     // Between the semicolons stands the series within the file.
     let (file, _) = rest.rsplit_once(';').ok_or_else(form)?;
@@ -97,7 +100,8 @@ fn tile(text: &str, dimensions: usize) -> Result<ListedTile, String> {
     let numbers: Result<Vec<f64>, _> = inside.split(',').map(|n| n.trim().parse()).collect();
     let numbers = numbers.map_err(|_| form())?;
     if numbers.len() != dimensions || !numbers.iter().all(|n| n.is_finite()) {
-        return Err(format!("{text:?} does not have {dimensions} coordinates"));
+        let text = quoted(text);
+        return Err(format!("{text} does not have {dimensions} coordinates"));
     }
     let z = numbers.get(2).copied().unwrap_or(0.0);
     if !(z >= 0.0 && z.fract() == 0.0 && z <= f64::from(u32::MAX)) {

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use glam::DVec2;
 
 use super::AcquisitionError;
+use super::text::{content, quoted};
 
 /// A line of a tile list.
 #[derive(Clone, Debug, PartialEq)]
@@ -38,8 +39,8 @@ pub(super) fn stem(file: &str) -> &str {
 ///
 /// # Errors
 ///
-/// [`AcquisitionError::Read`]; [`AcquisitionError::Line`] for the first line without three numbers
-/// at its end, or with a section that is no whole number from 0.
+/// [`AcquisitionError::Read`]; [`AcquisitionError::Utf16`]; [`AcquisitionError::Line`] for the first line without
+/// three numbers at its end, or with a section that is no whole number from 0.
 pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
     let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
         source,
@@ -54,7 +55,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
 ///
 /// As [`read`], but for reading.
 pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
-    let text = String::from_utf8_lossy(bytes);
+    let text = String::from_utf8_lossy(content(bytes, path)?);
     let mut tiles = Vec::new();
     for (line, text) in (1..).zip(text.lines()) {
         let text = text.trim();
@@ -75,21 +76,22 @@ fn listed(text: &str) -> Result<ListedTile, String> {
     let mut column = || {
         let (rest, last) = file
             .rsplit_once(char::is_whitespace)
-            .ok_or_else(|| format!("{text:?} is not `file x y z`"))?;
+            .ok_or_else(|| format!("{} is not `file x y z`", quoted(text)))?;
         file = rest.trim_end();
         Ok::<_, String>(last)
     };
     let (z, y, x) = (column()?, column()?, column()?);
     let number = |what: &str, text: &str| match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
-        _ => Err(format!("{what} is {text:?}, which is no number")),
+        _ => Err(format!("{what} is {}, which is no number", quoted(text))),
     };
     let corner = DVec2::new(number("x", x)?, number("y", y)?);
     let z_value = number("z", z)?;
     let valid = z_value >= 0.0 && z_value.fract() == 0.0 && z_value <= f64::from(u32::MAX);
     if !valid {
         return Err(format!(
-            "z is {z:?}, but a section is a whole number from 0"
+            "z is {}, but a section is a whole number from 0",
+            quoted(z)
         ));
     }
     #[expect(clippy::cast_possible_truncation, reason = "checked above")]

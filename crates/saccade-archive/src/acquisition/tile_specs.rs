@@ -10,6 +10,7 @@ use saccade_core::transform::SectionFromTile;
 use serde::Deserialize;
 
 use super::AcquisitionError;
+use super::text::content;
 use super::tile_list::stem;
 
 /// A tile of a Render stack.
@@ -86,7 +87,7 @@ struct Transform {
 ///
 /// # Errors
 ///
-/// [`AcquisitionError::Read`], [`AcquisitionError::Json`], and [`AcquisitionError::Tile`] for a tile that
+/// [`AcquisitionError::Read`], [`AcquisitionError::Utf16`], [`AcquisitionError::Json`], and [`AcquisitionError::Tile`] for a tile that
 /// cannot be used.
 pub fn read(path: &Path) -> Result<Vec<TileSpec>, AcquisitionError> {
     let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
@@ -103,7 +104,7 @@ pub fn read(path: &Path) -> Result<Vec<TileSpec>, AcquisitionError> {
 /// As [`read`], but for reading.
 pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<TileSpec>, AcquisitionError> {
     let specs: Vec<Json> =
-        serde_json::from_slice(bytes).map_err(|source| AcquisitionError::Json {
+        serde_json::from_slice(content(bytes, path)?).map_err(|source| AcquisitionError::Json {
             source,
             path: path.to_owned(),
         })?;

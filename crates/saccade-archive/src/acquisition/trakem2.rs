@@ -1,6 +1,7 @@
 //! TrakEM2 projects: the affine transform of every patch.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
@@ -9,6 +10,7 @@ use roxmltree::{Document, Node, ParsingOptions};
 use saccade_core::transform::SectionFromTile;
 
 use super::AcquisitionError;
+use super::text::{content, quoted};
 use super::tile_list::stem;
 
 /// A patch of a TrakEM2 project: a tile and where it lies.
@@ -22,6 +24,8 @@ pub struct Patch {
     pub size: UVec2,
     /// To pixels of the section from pixels of the tile.
     pub transform: SectionFromTile,
+    /// Kinds of coordinate transform that are left out: what is not affine, such as deformations of the lens.
+    pub left_out: Vec<String>,
 }
 
 impl Patch {
@@ -33,12 +37,12 @@ impl Patch {
 
 /// Reads the patches of a project, layer by layer.
 ///
-/// Only affine transforms are understood; a patch that also carries a coordinate transform gets its
-/// affine part.
+/// Only the affine transform of a patch is understood; coordinate transforms that it carries besides are left out, which
+/// [`Patch::left_out`] tells.
 ///
 /// # Errors
 ///
-/// [`AcquisitionError::Read`], [`AcquisitionError::Xml`], and [`AcquisitionError::Line`] for a patch
+/// [`AcquisitionError::Read`], [`AcquisitionError::Utf16`], [`AcquisitionError::Xml`], and [`AcquisitionError::Line`] for a patch
 /// without a file, a size or an invertible transform.
 pub fn read(path: &Path) -> Result<Vec<Patch>, AcquisitionError> {
     let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
@@ -54,6 +58,7 @@ pub fn read(path: &Path) -> Result<Vec<Patch>, AcquisitionError> {
 ///
 /// As [`read`], but for reading.
 pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<Patch>, AcquisitionError> {
+    let bytes = content(bytes, path)?;
     // TrakEM2 writes ISO 8859-1; what is not ASCII there can only be part of a name.
     let text = match std::str::from_utf8(bytes) {
         Ok(text) => Cow::Borrowed(text),
@@ -111,15 +116,46 @@ fn patch(node: Node<'_, '_>, section: u32) -> Result<Patch, String> {
     };
     let size = UVec2::new(side("o_width", "width")?, side("o_height", "height")?);
     let transform = attribute(node, "transform")?;
-    let elements = matrix(transform)
-        .ok_or_else(|| format!("transform is {transform:?}, not `matrix(a,b,c,d,tx,ty)`"))?;
+    let elements = matrix(transform).ok_or_else(|| {
+        format!(
+            "transform is {}, not `matrix(a,b,c,d,tx,ty)`",
+            quoted(transform)
+        )
+    })?;
     let transform = SectionFromTile::new(elements).map_err(|e| e.to_string())?;
+    let more = node
+        .descendants()
+        .filter(|n| n.has_tag_name("ict_transform"));
+    let kinds = more.map(|more| {
+        let class = more.attribute("class").unwrap_or_default();
+        class.rsplit('.').next().unwrap_or_default().to_owned()
+    });
     Ok(Patch {
         file,
         section,
         size,
         transform,
+        left_out: kinds.collect(),
     })
+}
+
+/// What is to be said of coordinate transforms that are left out, if there are any.
+pub fn left_out(patches: &[Patch], path: &Path) -> Option<String> {
+    let mut of = patches.iter().filter(|patch| !patch.left_out.is_empty());
+    let first = of.next()?;
+    let kinds: BTreeSet<&str> = { patches.iter() }
+        .flat_map(|patch| patch.left_out.iter().map(String::as_str))
+        .collect();
+    let kinds: Vec<_> = kinds.into_iter().collect();
+    Some(format!(
+        "of {} tiles, such as {:?}, the affine transform alone is used: coordinate transforms ({}) cannot be, so that \
+         they lie where the project has them but are not deformed; let TrakEM2 apply them to the images, or use \
+         affine transforms only: {}",
+        1 + of.count(),
+        first.name(),
+        kinds.join(", "),
+        path.display()
+    ))
 }
 
 fn attribute<'a>(node: Node<'a, '_>, name: &str) -> Result<&'a str, String> {
@@ -131,7 +167,7 @@ fn attribute<'a>(node: Node<'a, '_>, name: &str) -> Result<&'a str, String> {
 fn number(text: &str, what: &str) -> Result<f64, String> {
     text.trim()
         .parse()
-        .map_err(|_| format!("{what} is {text:?}, which is no number"))
+        .map_err(|_| format!("{what} is {}, which is no number", quoted(text)))
 }
 
 fn matrix(text: &str) -> Option<[f64; 6]> {
@@ -179,6 +215,33 @@ mod tests {
             patches[0].transform.elements(),
             [1.0, 0.5, -0.5, 1.0, 10.0, 20.0]
         );
+    }
+
+    #[test]
+    fn what_is_not_affine_is_left_out_and_told() {
+        let patch = |name: &str, more: &str| {
+            format!(
+                r#"<t2_patch width="9" height="7" transform="matrix(1,0,0,1,3,4)" file_path="{name}.tif">{more}</t2_patch>"#
+            )
+        };
+        let more = r#"<ict_transform_list><ict_transform class="lenscorrection.NonLinearTransform" data="5 1"/>
+            <ict_transform class="some.Spline" data=""/></ict_transform_list>"#;
+        let all = [patch("a", ""), patch("b", more), patch("c", more)].concat();
+        let patches = project(&format!("<t2_layer z=\"0\">{all}</t2_layer>")).unwrap();
+        assert_eq!(patches[1].left_out, ["NonLinearTransform", "Spline"]);
+        assert_eq!(patches[1].transform.elements()[4..], [3.0, 4.0]);
+        let path = Path::new("project.xml");
+        let said = left_out(&patches, path).unwrap();
+        for part in [
+            "2 tiles",
+            "\"b\"",
+            "NonLinearTransform, Spline",
+            "affine",
+            "project.xml",
+        ] {
+            assert!(said.contains(part), "{said}");
+        }
+        assert_eq!(left_out(&patches[..1], path), None);
     }
 
     #[test]

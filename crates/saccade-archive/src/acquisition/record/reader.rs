@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::prefix::{HEAD, MAX_LINE, Prefix, read_line};
 use super::{BrokenRecord, Record, parse};
+use crate::acquisition::text::unmarked;
 use crate::acquisition::{AcquisitionError, refuse_link_out};
 
 /// How far the records were read, and which.
@@ -174,16 +175,20 @@ impl RecordReader {
                 line: self.cursor.line + 1,
                 seen: Some(prefix.seen()),
             };
-            if text.iter().all(u8::is_ascii_whitespace) {
+            let said = match offset {
+                0 => unmarked(&text),
+                _ => &text,
+            };
+            if said.iter().all(u8::is_ascii_whitespace) {
                 continue;
             }
             let record = if read.bytes > MAX_LINE as u64 {
                 Err(format!("it has {} bytes, more than {MAX_LINE}", read.bytes))
             } else {
-                parse(&text)
+                parse(said)
             };
             let line = self.cursor.line;
-            let record = record.map_err(|reason| BrokenRecord::of(&text, line, reason));
+            let record = record.map_err(|reason| BrokenRecord::of(said, line, reason));
             lines.push(RecordLine {
                 offset,
                 next: self.cursor,

@@ -88,6 +88,30 @@ fn a_half_line_waits_for_its_end() {
 }
 
 #[test]
+fn what_editors_put_before_text_is_passed_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(RecordReader::FILE);
+    let good = serde_json::to_string(&tile("a")).unwrap();
+    let read = || {
+        let mut reader = RecordReader::new(folder.path(), Cursor::default());
+        reader.read(99).unwrap()
+    };
+    std::fs::write(&path, format!("\u{feff}{good}\n{good}\n")).unwrap();
+    assert_eq!(records(&read()), [tile("a"), tile("a")]);
+    let wide = format!("\u{feff}{good}\n");
+    let wide: Vec<_> = wide.encode_utf16().flat_map(u16::to_be_bytes).collect();
+    std::fs::write(&path, wide).unwrap();
+    let broken = read().remove(0).record.unwrap_err();
+    assert!(broken.reason.contains("UTF-16"), "{broken}");
+    // Not all of a text that is no number.
+    let long = "x".repeat(MAX_LINE / 2);
+    let text = good.replace("\"section\":3", &format!("\"section\":\"{long}\""));
+    std::fs::write(&path, format!("{text}\n")).unwrap();
+    let broken = read().remove(0).record.unwrap_err();
+    assert!(broken.reason.len() < 1000, "{}", broken.reason.len());
+}
+
+#[test]
 fn a_broken_line_is_named_and_passed() {
     let folder = tempfile::tempdir().unwrap();
     let good = serde_json::to_string(&tile("a")).unwrap();
