@@ -30,6 +30,7 @@ mod clock;
 mod commit;
 mod database;
 mod error;
+mod holders;
 mod identity;
 mod location;
 mod postgres;
@@ -57,7 +58,7 @@ pub use clock::{Clock, SystemClock};
 pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
 pub use error::CatalogError;
 pub use location::CatalogLocation;
-pub use workers::{Claim, Worker};
+pub use workers::{Claim, HeldUp, Worker};
 
 /// Most changes that [`Catalog::changes_after`] returns at once.
 pub const CHANGES_AT_ONCE: usize = 4096;
@@ -170,6 +171,17 @@ pub struct Retired {
     pub pyramid: String,
     /// Since when.
     pub at: SystemTime,
+}
+
+/// Which records say what a tile is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Origin {
+    /// The tile's name.
+    pub tile: String,
+    /// Position of the record that brought its image.
+    pub position: u64,
+    /// Position of the record that brought its transform.
+    pub transform_position: u64,
 }
 
 /// A volume and how far it is.
@@ -683,6 +695,19 @@ impl Catalog {
         self.ask(question, &[id.into()], rows::section).await
     }
 
+    /// The tiles that name a pyramid, by their ids. Looks at all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn origins(&self, volume: &str, pyramid: &str) -> Result<Vec<Origin>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT name, position, transform_position FROM tiles \
+                        WHERE volume = $1 AND pyramid = $2 AND deleted = 0 ORDER BY id";
+        let values = [id.into(), pyramid.into()];
+        self.ask(question, &values, rows::origin).await
+    }
+
     /// Counts a volume's tiles anew, in all and by section.
     ///
     /// # Errors
@@ -731,12 +756,24 @@ impl Catalog {
                 location: self.location().clone(),
             });
         }
+        self.look_for_file()?;
         let begun = Transaction::begin(&self.inner.database, durability).await;
         begun
             .map_err(|e| self.failed(e))?
             .ok_or_else(|| CatalogError::ReadOnly {
                 location: self.location().clone(),
             })
+    }
+
+    /// Whether the open file is still the one of its name: SQLite goes on with one that was moved or deleted, and what it
+    /// acknowledges is lost with it.
+    fn look_for_file(&self) -> Result<(), CatalogError> {
+        match &self.inner.database {
+            Database::Sqlite(opened) if opened.is_elsewhere() => Err(CatalogError::Moved {
+                location: self.location().clone(),
+            }),
+            Database::Sqlite(_) | Database::Postgres(_) => Ok(()),
+        }
     }
 
     async fn volume_id(&self, name: &str) -> Result<i64, CatalogError> {

@@ -13,7 +13,7 @@ use super::{
     Catalog, CatalogError, ChangeReason, NewTile, Quarantined, TileId, Waiting, Worker, place,
     postgres, rows,
 };
-use crate::acquisition::Cursor;
+use crate::acquisition::{Cursor, RecordReader};
 
 /// What became of a tile.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -184,7 +184,7 @@ impl<'c> Commit<'c> {
     /// Moves a tile, or keeps the transform until the tile comes.
     ///
     /// `position` is that of the record that says so; `None` for anyone else, whose word counts
-    /// until a newer image of the tile comes.
+    /// until a newer image of the tile comes. What was set aside of transforms that lead out of the volume is forgotten.
     ///
     /// # Errors
     ///
@@ -211,6 +211,7 @@ impl<'c> Commit<'c> {
             return Ok(TransformOutcome::Unchanged);
         }
         let place = self.place(tile, existing.section, existing.size, transform)?;
+        self.end_misplacement(tile).await?;
         let moved = existing.transform != transform;
         if moved {
             let reason = ChangeReason::Transform;
@@ -230,6 +231,26 @@ impl<'c> Commit<'c> {
         } else {
             TransformOutcome::Unchanged
         })
+    }
+
+    /// Takes a pyramid that is another's from a tile: until its record is done anew, it has one that is not there.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn detach(&mut self, tile: &str) -> Result<(), CatalogError> {
+        let Some(existing) = self.existing(tile).await?.filter(|e| !e.deleted) else {
+            return Ok(());
+        };
+        let (id, place) = (existing.id, existing.place);
+        self.log_change(id, place, place, ChangeReason::Tile)
+            .await?;
+        // No record's: those end with a position.
+        let none = format!("{}-none", existing.pyramid);
+        let update = "UPDATE tiles SET pyramid = $2, revision = $3 WHERE id = $1";
+        let values = [id.0.into(), (&none).into(), self.revision.into()];
+        self.run(update, &values).await?;
+        Ok(())
     }
 
     /// Deletes a tile, and what waits or is in quarantine under its name. Its pyramid is retired as of
@@ -278,6 +299,15 @@ impl<'c> Commit<'c> {
     async fn end_quarantine(&mut self, tile: &str) -> Result<(), CatalogError> {
         let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2";
         self.run(end, &[self.volume.into(), tile.into()]).await?;
+        Ok(())
+    }
+
+    /// A record that says where a tile lies ends what was set aside of earlier ones that could not be followed: entries
+    /// of the records themselves, without a size. Those of images, and of lines that are no records, stay.
+    async fn end_misplacement(&mut self, tile: &str) -> Result<(), CatalogError> {
+        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2 AND file = $3 AND bytes IS NULL";
+        let values = [self.volume.into(), tile.into(), RecordReader::FILE.into()];
+        self.run(end, &values).await?;
         Ok(())
     }
 
@@ -441,7 +471,7 @@ impl<'c> Commit<'c> {
     /// # Errors
     ///
     /// What the database says; nothing has changed then, except where a server was lost while it said
-    /// so: then look.
+    /// so: then look. [`CatalogError::Moved`] where the file was taken away meanwhile.
     pub async fn finish(mut self) -> Result<u64, CatalogError> {
         self.count_sections().await?;
         let changed = self.revision != self.before;
@@ -460,6 +490,8 @@ impl<'c> Commit<'c> {
         }
         let done = self.transaction.commit().await;
         done.map_err(|e| self.catalog.failed(e))?;
+        // One that was taken away meanwhile has taken this with it.
+        self.catalog.look_for_file()?;
         if changed {
             self.catalog
                 .inner

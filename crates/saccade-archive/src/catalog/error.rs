@@ -198,6 +198,41 @@ pub enum CatalogError {
         /// Where it is.
         location: CatalogLocation,
     },
+    /// Another program holds the file for longer than anybody needs for a transaction.
+    #[error(
+        "the catalog is locked{}: end it, or wait until it is done, and keep no database tool or backup \
+         program open on it: {location}",
+        by(holders)
+    )]
+    Locked {
+        /// What the database says.
+        source: sqlx::Error,
+        /// Programs that hold a lock, as far as the system tells.
+        holders: Vec<String>,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// The file is damaged.
+    #[error(
+        "the catalog's file is damaged: move it away with its -wal and -shm, and put a copy of it there, from which \
+         `saccade ingest` goes on and `saccade check` says what it lacks; without a copy, what `sqlite3 FILE .recover` \
+         saves, or take the acquisition in anew into another archive: {location}"
+    )]
+    Damaged {
+        /// What the database says.
+        source: sqlx::Error,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// The open file is not the one of its name any more: what is written to it may be lost with it.
+    #[error(
+        "the catalog's file was moved, deleted or replaced while it was in use, and nothing more is written: put it \
+         back, with its -wal if that was moved, and start again, which takes in what was not acknowledged: {location}"
+    )]
+    Moved {
+        /// Where it was.
+        location: CatalogLocation,
+    },
     /// Anything else; see the source.
     #[error("the catalog could not be read or written: {location}")]
     Database {
@@ -223,6 +258,15 @@ impl CatalogError {
                 location,
             },
             Case::Foreign => Self::NotACatalog { location },
+            Case::Locked => Self::Locked {
+                source,
+                holders: match &location {
+                    CatalogLocation::File(path) => super::holders::of(path),
+                    CatalogLocation::Postgres(_) => Vec::new(),
+                },
+                location,
+            },
+            Case::Damaged => Self::Damaged { source, location },
             Case::ReadOnly => Self::ReadOnly { location },
             Case::Unreachable => Self::Unreachable { source, location },
             Case::NoDatabase => Self::NoDatabase { source, location },
@@ -235,13 +279,11 @@ impl CatalogError {
     /// server may come back.
     pub fn is_transient(&self) -> bool {
         match self {
-            Self::Full { .. } | Self::Unreachable { .. } => true,
+            Self::Full { .. } | Self::Unreachable { .. } | Self::Locked { .. } => true,
             // SQLITE_IOERR.
             Self::Database { source, location } => match location {
                 CatalogLocation::File(_) => {
-                    self.is_busy()
-                        || primary_code(source) == Some(10)
-                        || matches!(source, sqlx::Error::PoolTimedOut)
+                    primary_code(source) == Some(10) || matches!(source, sqlx::Error::PoolTimedOut)
                 }
                 // Serialization failures, deadlocks, locks, lack of resources, system errors.
                 CatalogLocation::Postgres(_) => sql_state(source)
@@ -273,6 +315,9 @@ impl CatalogError {
             | Self::NotDurable { location, .. }
             | Self::Full { location, .. }
             | Self::NotSynced { location, .. }
+            | Self::Locked { location, .. }
+            | Self::Damaged { location, .. }
+            | Self::Moved { location }
             | Self::Database { location, .. } => Some(location),
             Self::Missed { .. }
             | Self::UnknownVolume { .. }
@@ -293,14 +338,14 @@ impl CatalogError {
 
     /// Whether another connection was in the way.
     pub(super) fn is_busy(&self) -> bool {
-        // SQLITE_BUSY, SQLITE_LOCKED.
-        matches!(self, Self::Database { source, location: CatalogLocation::File(_) }
-            if matches!(primary_code(source), Some(5 | 6)))
+        matches!(self, Self::Locked { .. })
     }
 }
 
 enum Case {
     Full,
+    Locked,
+    Damaged,
     NotSynced,
     Foreign,
     ReadOnly,
@@ -316,6 +361,9 @@ fn sqlite_case(error: &sqlx::Error) -> Case {
         return Case::NotSynced;
     }
     match primary_code(error) {
+        // SQLITE_BUSY, SQLITE_LOCKED.
+        Some(5 | 6) => Case::Locked,
+        Some(11) => Case::Damaged,
         Some(13) => Case::Full,
         Some(26) => Case::Foreign,
         _ => Case::Other,
@@ -358,6 +406,14 @@ fn primary_code(error: &sqlx::Error) -> Option<u32> {
 /// PostgreSQL's five characters.
 fn sql_state(error: &sqlx::Error) -> Option<String> {
     Some(error.as_database_error()?.code()?.into_owned())
+}
+
+/// Who holds a lock, behind "locked".
+fn by(holders: &[String]) -> String {
+    match holders {
+        [] => " by another program".to_owned(),
+        known => format!(" by {}", known.join(" and ")),
+    }
 }
 
 fn list(names: &[String]) -> String {

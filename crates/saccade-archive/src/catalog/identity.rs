@@ -44,6 +44,19 @@ impl Catalog {
         transaction.commit().await.map_err(|e| self.failed(e))
     }
 
+    /// Name of a pyramid of a volume; none while it has no tiles.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn pyramid_of(&self, volume: &str) -> Result<Option<String>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT pyramid FROM tiles WHERE volume = $1 AND deleted = 0 LIMIT 1";
+        let values = [id.into()];
+        let found = self.ask(question, &values, |row| row.get("pyramid"));
+        Ok(found.await?.into_iter().next())
+    }
+
     /// Names of some pyramids of any volume; none while there are no tiles.
     ///
     /// # Errors

@@ -9,8 +9,8 @@ use sqlx::Error;
 
 use super::database::Row;
 use super::{
-    CatalogChange, ChangeReason, Claim, Quarantined, Retired, Statistics, Tile, TileId,
-    VolumeEntry, Waiting,
+    CatalogChange, ChangeReason, Claim, HeldUp, Origin, Quarantined, Retired, Statistics, Tile,
+    TileId, VolumeEntry, Waiting,
 };
 use crate::acquisition::Cursor;
 
@@ -148,6 +148,22 @@ pub(super) fn claim(row: &Row) -> Result<Claim, Error> {
         waiting: waiting(row)?,
         deaths: small(row, "attempts")?,
         parked: parked != 0,
+    })
+}
+
+pub(super) fn origin(row: &Row) -> Result<Origin, Error> {
+    Ok(Origin {
+        tile: row.get("name")?,
+        position: unsigned(row, "position")?,
+        transform_position: unsigned(row, "transform_position")?,
+    })
+}
+
+pub(super) fn held_up(row: &Row) -> Result<HeldUp, Error> {
+    Ok(HeldUp {
+        worker: row.get("name")?,
+        why: row.get("why")?,
+        since: time(row, "since")?,
     })
 }
 

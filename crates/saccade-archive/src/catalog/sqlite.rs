@@ -62,6 +62,8 @@ pub(super) struct Opened {
     /// none if the file may only be read.
     pub(super) writer: Option<SqlitePool>,
     pub(super) readers: SqlitePool,
+    /// Which file it was when it was opened; `None` if the system did not tell.
+    id: Option<FileId>,
     /// Transactions in the write-ahead log, about.
     logged: AtomicU32,
     /// Why nothing may be written any more: a sync failed.
@@ -76,6 +78,7 @@ impl Opened {
         Self {
             path: path.to_owned(),
             access,
+            id: FileId::of(path).ok(),
             writer,
             readers,
             // What is there from before is not known.
@@ -92,6 +95,15 @@ impl Opened {
     /// Why nothing may be written any more, if so.
     pub(super) fn stopped(&self) -> Option<&str> {
         self.stopped.get().map(String::as_str)
+    }
+
+    /// Whether the name is another file's by now, or nobody's. A disk that cannot be asked tells by itself.
+    pub(super) fn is_elsewhere(&self) -> bool {
+        match (self.id, FileId::of(&self.path)) {
+            (Some(id), Ok(now)) => id != now,
+            (Some(_), Err(e)) => e.kind() == std::io::ErrorKind::NotFound,
+            (None, _) => false,
+        }
     }
 
     /// Before a transaction: moves what is in the log to the file once it is long. Where a sync of that
@@ -194,9 +206,44 @@ fn is_write_protected(path: &Path) -> bool {
 
 /// SQLite's write-ahead log.
 pub(super) fn log_of(path: &Path) -> PathBuf {
+    beside(path, "-wal")
+}
+
+/// What SQLite's processes share of the log.
+pub(super) fn shared_memory_of(path: &Path) -> PathBuf {
+    beside(path, "-shm")
+}
+
+fn beside(path: &Path, end: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
-    name.push("-wal");
+    name.push(end);
     name.into()
+}
+
+/// Tells a file from every other of its name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct FileId {
+    device: u64,
+    pub(super) inode: u64,
+}
+
+impl FileId {
+    /// Of the file that has that name now.
+    #[cfg(unix)]
+    pub(super) fn of(path: &Path) -> std::io::Result<Self> {
+        use std::os::unix::fs::MetadataExt as _;
+        let meta = std::fs::metadata(path)?;
+        Ok(Self {
+            device: meta.dev(),
+            inode: meta.ino(),
+        })
+    }
+
+    /// Of the file that has that name now.
+    #[cfg(not(unix))]
+    pub(super) fn of(_: &Path) -> std::io::Result<Self> {
+        Err(std::io::ErrorKind::Unsupported.into())
+    }
 }
 
 /// A file that is not SQLite's is refused before SQLite touches it.
@@ -432,6 +479,107 @@ mod tests {
         sqlx::query(room(1 << 30)).execute(writer).await.unwrap();
         catalog.commit_tile("v", &tile("again")).await.unwrap();
         assert_eq!(count().await, entered + 1);
+    }
+
+    /// SQLite goes on with a file that has lost its name, whose content is lost when it is closed.
+    #[tokio::test]
+    async fn what_is_moved_deleted_or_replaced_is_written_to_no_more() {
+        let (folder, path, catalog) = written().await;
+        let away = folder.path().join("away.sqlite");
+        let moved = |error: &CatalogError| matches!(error, CatalogError::Moved { .. });
+        std::fs::rename(&path, &away).unwrap();
+        let refused = catalog.commit_tile("v", &tile("b")).await.unwrap_err();
+        assert!(moved(&refused) && !refused.is_transient(), "{refused}");
+        // Another in its place is not it either.
+        std::fs::copy(&away, &path).unwrap();
+        let refused = catalog.commit_tile("v", &tile("b")).await.unwrap_err();
+        assert!(moved(&refused), "{refused}");
+        assert_eq!(catalog.entry("v").await.unwrap().tiles, 1);
+        std::fs::rename(&away, &path).unwrap();
+        catalog.commit_tile("v", &tile("b")).await.unwrap();
+
+        // Taken away in the middle of a transaction.
+        let mut commit = catalog.begin("v").await.unwrap();
+        commit
+            .tile(&tile("c"), std::time::SystemTime::now())
+            .await
+            .unwrap();
+        std::fs::remove_file(&path).unwrap();
+        let refused = commit.finish().await.unwrap_err();
+        assert!(moved(&refused), "{refused}");
+        let said = refused.to_string();
+        assert!(
+            said.contains("moved, deleted or replaced") && said.contains("put it back"),
+            "{said}"
+        );
+    }
+
+    /// As another program would, such as a backup: this one, once more.
+    #[tokio::test]
+    async fn who_has_locked_it_is_told() {
+        const LOCKS: &str = "SACCADE_TEST_LOCKS_CATALOG";
+        const NAME: &str = "catalog::sqlite::tests::who_has_locked_it_is_told";
+        if let Some(path) = std::env::var_os(LOCKS) {
+            let mut other = options(Path::new(&path), Access::Write)
+                .connect()
+                .await
+                .unwrap();
+            sqlx::query("BEGIN IMMEDIATE")
+                .execute(&mut other)
+                .await
+                .unwrap();
+            std::io::Write::write_all(&mut std::io::stdout(), b"\nlocked\n").unwrap();
+            let _until_it_is_closed = std::io::stdin().read_to_end(&mut Vec::new());
+            return;
+        }
+        let (_folder, path, catalog) = written().await;
+        catalog.close().await;
+        let mut other = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", NAME, "--nocapture"])
+            .env(LOCKS, &path)
+            .stdin(std::process::Stdio::piped())
+            .stdout(std::process::Stdio::piped())
+            .spawn()
+            .unwrap();
+        let said = std::io::BufReader::new(other.stdout.take().unwrap());
+        let mut said = std::io::BufRead::lines(said).map_while(Result::ok);
+        assert!(said.any(|line| line == "locked"));
+        let holders = super::super::holders::of(&path);
+        let id = format!("(process {})", other.id());
+        drop(other.stdin.take());
+        other.wait().unwrap();
+        assert!(
+            holders.len() == 1 && holders[0].ends_with(&id),
+            "{holders:?}"
+        );
+        let locked = CatalogError::Locked {
+            source: sqlx::Error::PoolTimedOut,
+            holders,
+            location: path.as_path().into(),
+        };
+        let said = locked.to_string();
+        assert!(
+            locked.is_transient() && said.contains("is locked by ") && said.contains(&id),
+            "{said}"
+        );
+        assert!(super::super::holders::of(&path).is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_damaged_file_is_named_with_the_way_out() {
+        let (_folder, path, catalog) = written().await;
+        catalog.close().await;
+        let mut bytes = std::fs::read(&path).unwrap();
+        let page = 4096;
+        bytes[page..].fill(0x5a);
+        std::fs::write(&path, bytes).unwrap();
+        let refused = Catalog::create(&path).await.err().unwrap();
+        let said = refused.to_string();
+        assert!(matches!(refused, CatalogError::Damaged { .. }), "{said}");
+        assert!(
+            said.contains("copy") && said.contains("saccade check"),
+            "{said}"
+        );
     }
 
     async fn to_read(path: &Path) -> Catalog {

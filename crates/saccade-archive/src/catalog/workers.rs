@@ -38,6 +38,17 @@ pub struct Claim {
     pub parked: bool,
 }
 
+/// What holds up a worker.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HeldUp {
+    /// What people call the worker.
+    pub worker: String,
+    /// What it waits for, in words.
+    pub why: String,
+    /// Since when.
+    pub since: SystemTime,
+}
+
 /// Number of the lock under which records of volume 0 are claimed; other programs use others.
 const CLAIMING: i64 = 0x5361_6363_0000_0000;
 
@@ -71,6 +82,10 @@ impl Catalog {
         let ago = rows::millis(now.checked_sub(day).unwrap_or(SystemTime::UNIX_EPOCH));
         let forget = "DELETE FROM workers WHERE lease < $1";
         let forgotten = transaction.run(forget, &[ago.into()]).await;
+        forgotten.map_err(|e| self.failed(e))?;
+        let forget = "DELETE FROM held_up WHERE NOT EXISTS \
+                      (SELECT 1 FROM workers k WHERE k.id = held_up.worker)";
+        let forgotten = transaction.run(forget, &[]).await;
         forgotten.map_err(|e| self.failed(e))?;
         let insert = "INSERT INTO workers (name, process, lease) VALUES ($1, $2, $3) RETURNING id";
         let until = rows::millis(now + lease);
@@ -222,12 +237,73 @@ impl Catalog {
         let mut transaction = self.transaction(Durability::Soon).await?;
         for release in [
             "UPDATE waiting SET worker = NULL, begun = 0 WHERE worker = $1",
+            "DELETE FROM held_up WHERE worker = $1",
             "DELETE FROM workers WHERE id = $1",
         ] {
             let done = transaction.run(release, &[worker.id.into()]).await;
             done.map_err(|e| self.failed(e))?;
         }
         transaction.commit().await.map_err(|e| self.failed(e))
+    }
+
+    /// Notes what holds up a worker on a volume, each with since when, in place of what was noted before.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn tell_held_up(
+        &self,
+        volume: &str,
+        worker: &Worker,
+        reasons: &[(String, SystemTime)],
+    ) -> Result<(), CatalogError> {
+        let volume = self.volume_id(volume).await?;
+        let mut transaction = self.transaction(Durability::Soon).await?;
+        let forget = "DELETE FROM held_up WHERE volume = $1 AND worker = $2";
+        let forgotten = transaction
+            .run(forget, &[volume.into(), worker.id.into()])
+            .await;
+        forgotten.map_err(|e| self.failed(e))?;
+        for (number, (why, since)) in (0_u32..).zip(reasons) {
+            let note = "INSERT INTO held_up (volume, worker, number, why, since) \
+                        VALUES ($1, $2, $3, $4, $5)";
+            let values = [
+                volume.into(),
+                worker.id.into(),
+                number.into(),
+                why.into(),
+                rows::millis(*since).into(),
+            ];
+            let noted = transaction.run(note, &values).await;
+            noted.map_err(|e| self.failed(e))?;
+        }
+        transaction.commit().await.map_err(|e| self.failed(e))
+    }
+
+    /// What holds up the workers of a volume, the longest first. Those that have given no sign of life are not
+    /// waiting: they are dead.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn held_up(&self, volume: &str) -> Result<Vec<HeldUp>, CatalogError> {
+        let volume = self.volume_id(volume).await?;
+        let question = Statement {
+            sqlite: "SELECT k.name, h.why, h.since FROM held_up h JOIN workers k ON k.id = h.worker \
+                     WHERE h.volume = $1 AND k.lease >= $2 ORDER BY h.since, h.worker, h.number",
+            // Leases are measured by the server's clock, unless there is another.
+            postgres: "SELECT k.name, h.why, h.since FROM held_up h JOIN workers k ON k.id = h.worker \
+                       WHERE h.volume = $1 AND k.lease >= CASE WHEN $2 < 0 \
+                       THEN (extract(epoch FROM clock_timestamp()) * 1000)::bigint ELSE $2 END \
+                       ORDER BY h.since, h.worker, h.number",
+        };
+        let now = match (self.inner.clock.get(), &self.inner.database) {
+            (Some(clock), _) => rows::millis(clock.now()),
+            (None, Database::Sqlite(_)) => rows::millis(SystemTime::now()),
+            (None, Database::Postgres(_)) => -1,
+        };
+        self.ask(question, &[volume.into(), now.into()], rows::held_up)
+            .await
     }
 
     /// Records of a volume that are to be worked on, claimed or not, and those whose file is not

@@ -145,6 +145,11 @@ impl PyramidIndex {
         self.checksums.as_deref()
     }
 
+    /// Whether its voxels are those of the image, rather than JPEG's.
+    pub fn is_lossless(&self) -> bool {
+        self.jpeg_tables.is_none()
+    }
+
     /// Type of the voxels.
     pub fn dtype(&self) -> Dtype {
         self.dtype
