@@ -24,6 +24,7 @@ mod images;
 mod options;
 mod prepare;
 mod process;
+mod reasons;
 mod records;
 mod run;
 mod waiting;

@@ -20,6 +20,7 @@
 //! It never changes the acquisition archive, and knows nothing of 3D: no levels, chunks or bricks.
 
 mod cancel;
+mod held_up;
 pub mod ingest;
 mod progress;
 pub mod replay;
@@ -29,4 +30,5 @@ pub mod update;
 pub mod watch;
 
 pub use cancel::Cancel;
+pub use held_up::{HeldUp, Part, Reason};
 pub use progress::{Meter, Progress, State};

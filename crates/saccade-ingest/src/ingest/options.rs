@@ -3,6 +3,8 @@ use std::time::Duration;
 
 use saccade_archive::pyramid::Encoding;
 
+use crate::held_up::HeldUp;
+
 /// How to ingest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct IngestOptions {
@@ -33,6 +35,9 @@ pub struct IngestOptions {
     pub attempts: u32,
     /// How long a replaced pyramid stays, for readers that still have its name.
     pub keep_retired: Duration,
+    /// What holds up those who find out what lies where, a [`Watch`](crate::watch::Watch) for example. While this works,
+    /// the catalog tells of it, as of what holds up the ingest itself.
+    pub held_up: Option<HeldUp>,
 }
 
 impl IngestOptions {
@@ -50,6 +55,7 @@ impl IngestOptions {
         lease: Duration::from_secs(20),
         attempts: 5,
         keep_retired: Duration::from_secs(60),
+        held_up: None,
     };
 }
 

@@ -23,8 +23,9 @@ use super::images::Images;
 use super::prepare::{Context, Outcome, Stored, quarantine};
 use super::records::patiently;
 use super::waiting::{Due, WaitingRoom};
-use super::{IngestError, IngestOptions, process};
+use super::{IngestError, IngestOptions, process, reasons};
 use crate::cancel::Cancel;
+use crate::held_up::Heard;
 use crate::progress::{Meter, Progress, State};
 
 /// Longest pause between looks for workers of this machine that were killed.
@@ -73,6 +74,12 @@ pub async fn run(
     progress: &dyn Progress,
     cancel: &Cancel,
 ) -> Result<Summary, IngestError> {
+    let held_up = options.held_up.clone().unwrap_or_default();
+    let heard = Heard {
+        inner: progress,
+        reasons: held_up.clone(),
+    };
+    let progress: &dyn Progress = &heard;
     let info = AcquisitionInfo::read(acquisition)?;
     let impossible = |source| IngestError::Volume {
         source,
@@ -132,7 +139,15 @@ pub async fn run(
         let work = pin!(ingest.follow());
         let cancelled = pin!(cancel.cancelled());
         let alive = pin!(keep_alive(archive, &worker));
-        match select(work, select(cancelled, alive)).await {
+        let called = called(acquisition, archive, options);
+        let told = pin!(reasons::tell(
+            archive,
+            &volume.name,
+            &worker,
+            &held_up,
+            &called
+        ));
+        match select(work, select(cancelled, select(alive, told))).await {
             Either::Left((done, _)) => done,
             Either::Right(_) => Ok(()),
         }
@@ -147,6 +162,19 @@ pub async fn run(
     done?;
     ingest.summary.early = catalog.statistics(&volume.name).await?.early;
     Ok(ingest.summary)
+}
+
+/// What those who look from elsewhere need not know.
+fn called(
+    acquisition: &Path,
+    archive: &VisualizationArchive,
+    options: &IngestOptions,
+) -> reasons::Called {
+    let catalog = archive.catalog().location().to_string();
+    let linked = options.linked.as_deref().unwrap_or(acquisition);
+    let folders = [linked, acquisition].map(|path| path.display().to_string());
+    let [linked, acquisition] = folders.map(|path| (path, "the acquisition's folder"));
+    vec![(catalog, "the catalog"), linked, acquisition]
 }
 
 /// What people call this worker.

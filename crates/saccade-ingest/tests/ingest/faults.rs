@@ -7,7 +7,7 @@ use std::time::Duration;
 use glam::UVec2;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::RecordReader;
-use saccade_archive::catalog::Catalog;
+use saccade_archive::catalog::{Catalog, CatalogError};
 use saccade_archive::storage::{FaultyStorage, LocalStorage, MemoryStorage, Storage, WriteFault};
 use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestError, IngestOptions, run};
@@ -113,7 +113,6 @@ async fn a_full_disk_is_waited_out() {
     bench.is_complete().await;
 }
 
-/// It would be there for ever: nobody but a person can take it away.
 /// As where the archive's disk is unmounted: an empty folder is in its place, and the catalog is elsewhere.
 #[tokio::test]
 async fn an_archive_whose_disk_is_away_is_waited_for() {
@@ -188,6 +187,7 @@ async fn a_file_that_is_filled_while_it_is_read_is_waited_for() {
     assert!(pixels(&tile).await == texture(LARGE, 7), "half of it");
 }
 
+/// It would be there for ever: nobody but a person can take it away.
 #[tokio::test]
 async fn a_folder_in_the_place_of_a_pyramid_is_told_and_holds_nothing_up() {
     let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
@@ -208,6 +208,104 @@ async fn a_folder_in_the_place_of_a_pyramid_is_told_and_holds_nothing_up() {
     }
     assert!(occupied.is_dir());
     assert_eq!(scope.ingest(&archive).await.quarantined, 0);
+}
+
+/// As `saccade serve` tells it, which may run on another machine.
+#[tokio::test]
+async fn what_holds_it_up_is_in_the_catalog_as_long_as_it_does() {
+    let bench = Bench::new().await;
+    bench.storage.set_space(Some(1));
+    let (cancel, catalog) = (Cancel::new(), bench.archive.catalog());
+    let options = IngestOptions {
+        once: false,
+        lease: Duration::from_secs(60),
+        ..quick()
+    };
+    let ingest = run(bench.scope.path(), &bench.archive, &options, &(), &cancel);
+    let look = async {
+        let reasons = async |some: bool| {
+            for _ in 0..2000 {
+                tokio::time::sleep(Duration::from_millis(10)).await;
+                let held_up = catalog.held_up(VOLUME).await.unwrap_or_default();
+                if held_up.is_empty() != some {
+                    return held_up;
+                }
+            }
+            panic!("it does not wait, or not go on");
+        };
+        let reason = reasons(true).await.remove(0);
+        assert!(
+            reason.why.contains("no space is left to write"),
+            "{}",
+            reason.why
+        );
+        assert!(reason.worker.ends_with(&format!(":{}", std::process::id())));
+        assert!(reason.since.elapsed().unwrap() < Duration::from_secs(60));
+        bench.storage.set_space(None);
+        reasons(false).await;
+        // It is not that it ended.
+        assert!(!catalog.processes().await.unwrap().is_empty());
+        while seen(&bench.archive).await.len() < usize::from(TILES) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        cancel.cancel();
+    };
+    let both = async { tokio::join!(ingest, look) };
+    let both = tokio::time::timeout(Duration::from_secs(120), both).await;
+    both.expect("it ends").0.unwrap();
+    bench.is_complete().await;
+}
+
+/// Who is killed while it waits waits no more.
+#[tokio::test]
+async fn the_dead_wait_for_nothing() {
+    let bench = Bench::new().await;
+    bench.scope.ingest(&bench.archive).await;
+    let catalog = bench.archive.catalog();
+    let lease = Duration::from_millis(300);
+    let worker = catalog.register("scope:7", lease).await.unwrap();
+    let reason = ("the share is away".to_owned(), std::time::SystemTime::now());
+    catalog
+        .tell_held_up(VOLUME, &worker, &[reason])
+        .await
+        .unwrap();
+    assert_eq!(catalog.held_up(VOLUME).await.unwrap()[0].worker, "scope:7");
+    tokio::time::sleep(2 * lease).await;
+    assert_eq!(catalog.held_up(VOLUME).await.unwrap(), []);
+}
+
+/// SQLite would go on with a file that has lost its name, and all that was acknowledged would be lost with it.
+#[tokio::test]
+async fn a_catalog_that_is_taken_away_ends_it() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    let [file, away] = ["catalog.sqlite", "away"].map(|name| folder.path().join(name));
+    scope.tile("t0", 0, SIZE, 0);
+    let options = IngestOptions {
+        once: false,
+        ..quick()
+    };
+    let (cancel, diary) = (Cancel::new(), Diary::default());
+    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
+    let take = async {
+        while diary.states().last().is_none_or(|state| state.tiles < 1) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        fs::rename(&file, &away).unwrap();
+        scope.tile("t1", 1, SIZE, 1);
+    };
+    let both = async { tokio::join!(ingest, take) };
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+    let ended = both.expect("it ends").0.unwrap_err();
+    assert!(
+        matches!(ended, IngestError::Catalog(CatalogError::Moved { .. })),
+        "{ended}"
+    );
+    archive.catalog().close().await;
+    fs::rename(&away, &file).unwrap();
+    let archive = crate::scope::archive(folder.path()).await;
+    scope.ingest(&archive).await;
+    assert_eq!(seen(&archive).await.len(), 2);
 }
 
 #[tokio::test]
