@@ -31,14 +31,17 @@ use saccade_archive::image::read_size;
 use saccade_core::transform::SectionFromTile;
 
 use crate::Cancel;
+use crate::held_up::HeldUp;
 use crate::simulate::settings::{Settings, difference, volume_differences};
 use list::List;
+use looking::{Looks, Passes, look_on};
 use stamp::Seen;
 use stamps::Stamps;
 
 mod again;
 mod list;
 mod listed;
+mod looking;
 mod pattern;
 mod scan;
 mod stamp;
@@ -144,6 +147,9 @@ pub struct Watch<F> {
     unread: VecDeque<Unread>,
     /// Whether the folder was gone through once.
     seen: bool,
+    /// Whether it is still to be said that no file fits the pattern.
+    tells_misfits: bool,
+    held_up: HeldUp,
 }
 
 /// Whether nothing was told yet, and nobody is about to: then a mistake in an option binds nobody.
@@ -256,6 +262,8 @@ impl<F: Folders> Watch<F> {
             stamps,
             unread: VecDeque::new(),
             seen: false,
+            tells_misfits: false,
+            held_up: HeldUp::default(),
         };
         watch.take_over()?;
         Ok(watch)
@@ -265,6 +273,13 @@ impl<F: Folders> Watch<F> {
     /// [`IngestOptions::linked`](crate::ingest::IngestOptions::linked).
     pub fn folder(&self) -> &Path {
         &self.folder
+    }
+
+    /// Tells what it waits for.
+    #[must_use]
+    pub fn telling(mut self, held_up: HeldUp) -> Self {
+        self.held_up = held_up;
+        self
     }
 
     /// Whether this process writes the records. If not, another does that watches the same folder, until it ends.
@@ -336,24 +351,8 @@ impl<F: Folders> Watch<F> {
 
     /// Writes what is to be told; how much it was. What cannot be written is kept.
     fn tell(&mut self) -> Result<u64, WatchError> {
-        let mut told = 0;
-        if let Some(list) = &mut self.list {
-            let mut stamps = Vec::new();
-            let written = loop {
-                let Some((record, stamp)) = self.untold.front() else {
-                    break list.sync();
-                };
-                if let Err(e) = list.append(record) {
-                    break Err(e);
-                }
-                stamps.extend(*stamp);
-                self.untold.pop_front();
-                told += 1;
-            };
-            self.stamps.add(&stamps);
-            written?;
-        }
-        Ok(told)
+        let (list, untold, stamps) = (&mut self.list, &mut self.untold, &mut self.stamps);
+        Ok(list::tell(list.as_mut(), untold, stamps)?)
     }
 
     /// One look; how many files were told of, and what to do next. While another process writes the records,
@@ -458,56 +457,41 @@ pub fn run<F: Folders>(
     once: bool,
     cancel: &Cancel,
 ) -> Result<u64, WatchError> {
-    /// Looks at a disk that stays full, or a folder that stays away, after which it is said again.
-    const SAY_AGAIN: u32 = 40;
-    /// Looks at a folder that cannot be listed, for those who wait for the end.
-    const LOOKS_ONCE: u32 = 10;
-    let mut told = 0;
-    let mut failures: u32 = 0;
-    let mut full: u32 = 0;
-    let mut warned = false;
-    while !cancel.is_cancelled() {
-        match watch.look() {
-            Ok((new, next)) => {
-                if failures > 0 {
-                    log::warn!("the folder can be looked into again");
-                }
-                (failures, full) = (0, 0);
-                told += new;
-                // Who looks once is told by the caller.
-                if let Some(why) = watch.unmatched().filter(|_| !once && !warned) {
-                    log::warn!("{why}; files that fit are waited for");
-                    warned = true;
-                }
-                match next {
-                    Next::More => continue,
-                    Next::Rest if once => break,
-                    Next::Again | Next::Rest => {}
-                }
-            }
-            Err(WatchError::Look { source, path }) if !once || failures < LOOKS_ONCE => {
-                if failures.is_multiple_of(SAY_AGAIN) {
-                    log::warn!(
-                        "cannot look into {}, trying again: {source}",
-                        path.display()
-                    );
-                }
-                failures = failures.saturating_add(1);
-            }
-            Err(e) if e.is_full() => {
-                if full.is_multiple_of(SAY_AGAIN) {
-                    log::warn!("{e}; trying again");
-                }
-                full += 1;
-            }
-            Err(e) => return Err(e),
+    // Who looks once is told by the caller.
+    watch.tells_misfits = !once;
+    look_on(watch, once, cancel, |_| false)
+}
+
+impl<F: Folders> Looks for Watch<F> {
+    type Error = WatchError;
+
+    const BACK: &'static str = "the folder can be looked into again";
+
+    fn look(&mut self) -> Result<(u64, Next), WatchError> {
+        let looked = Self::look(self);
+        if self.tells_misfits
+            && looked.is_ok()
+            && let Some(why) = self.unmatched()
+        {
+            log::warn!("{why}; files that fit are waited for");
+            self.tells_misfits = false;
         }
-        let mut left = watch.config.poll;
-        while !left.is_zero() && !cancel.is_cancelled() {
-            let nap = left.min(Duration::from_millis(50));
-            std::thread::sleep(nap);
-            left -= nap;
-        }
+        looked
     }
-    Ok(told)
+
+    fn poll(&self) -> Duration {
+        self.config.poll
+    }
+
+    fn passes(&self, error: &WatchError) -> Passes {
+        Passes::of(error)
+    }
+
+    fn waits_for(&self) -> Option<String> {
+        self.unmatched()
+    }
+
+    fn held_up(&self) -> &HeldUp {
+        &self.held_up
+    }
 }

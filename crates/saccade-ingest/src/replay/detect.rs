@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use saccade_archive::acquisition::tile_list::{Images, ListedTile};
-use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, trakem2};
+use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, is_inside, trakem2};
 
 use super::acquisition::median_offset;
 use super::lists::{self, List, Solution};
@@ -51,11 +51,20 @@ impl Input {
                 )
             }
             Self::Acquisition(acquisition) => {
-                let solution = match &acquisition.solution {
-                    Some(path) => format!("later moved by {}", path.display()),
-                    None => "without a later solution".to_owned(),
-                };
                 let (tiles, sections) = (acquisition.tiles.len(), acquisition.extent.z);
+                let solved = acquisition
+                    .tiles
+                    .iter()
+                    .filter(|tile| tile.aligned.is_some());
+                let solution = match (&acquisition.solution, solved.count()) {
+                    (Some(path), all) if all == tiles => {
+                        format!("later moved by {}", path.display())
+                    }
+                    (Some(path), some) => {
+                        format!("{some} of which are later moved by {}", path.display())
+                    }
+                    (None, _) => "without a later solution".to_owned(),
+                };
                 let list = acquisition.list.display();
                 let bits = 8 * acquisition.dtype.bytes();
                 let mixed = match acquisition.shallow {
@@ -110,6 +119,7 @@ pub fn detect(path: &Path) -> Result<Input, ReplayError> {
 
 /// Files and folders below a folder, in a settled order: less deep first, then by name.
 struct Tree {
+    root: PathBuf,
     files: Vec<PathBuf>,
     folders: Vec<PathBuf>,
 }
@@ -141,7 +151,22 @@ impl Tree {
         };
         settle(&mut files);
         settle(&mut folders);
-        Ok(Self { files, folders })
+        let root = folder.to_owned();
+        Ok(Self {
+            root,
+            files,
+            folders,
+        })
+    }
+
+    /// As of images: a link may lead to somewhere else in the folder.
+    fn refuse_link_out(&self, file: &Path) -> Result<(), AcquisitionError> {
+        match is_inside(file, &self.root, None) {
+            true => Ok(()),
+            false => Err(AcquisitionError::LeadsOut {
+                path: file.to_owned(),
+            }),
+        }
     }
 
     fn with_extension<'a>(&'a self, extension: &'a str) -> impl Iterator<Item = &'a Path> {
@@ -155,7 +180,7 @@ impl Tree {
 ///
 /// # Errors
 ///
-/// [`ReplayError`]: a list that cannot be read.
+/// [`ReplayError`]: a list that cannot be read; a link that leads out of the folder, if nothing else may be one.
 pub fn find_list(folder: &Path) -> Result<Option<PathBuf>, ReplayError> {
     let (tree, images) = (Tree::below(folder)?, Images::below(folder)?);
     if let Some((list, ..)) = chosen(&tree, &images)? {
@@ -177,7 +202,13 @@ pub fn find_list(folder: &Path) -> Result<Option<PathBuf>, ReplayError> {
             return Ok(Some(path.to_owned()));
         }
     }
-    Ok(None)
+    let mut lists = ["txt", "json", "xml"]
+        .into_iter()
+        .flat_map(|e| tree.with_extension(e));
+    match lists.find_map(|list| tree.refuse_link_out(list).err()) {
+        Some(leads_out) => Err(leads_out.into()),
+        None => Ok(None),
+    }
 }
 
 fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, ReplayError> {
@@ -198,6 +229,10 @@ fn chosen(tree: &Tree, images: &Images) -> Result<Option<(PathBuf, List, bool)>,
     let text = tree.with_extension("txt");
     for list in text.chain(tree.with_extension("json")).filter(small) {
         if lists::is_registered(list) {
+            continue;
+        }
+        // What whoever wrote the folder points at may be another's.
+        if tree.refuse_link_out(list).is_err() {
             continue;
         }
         let listed = match lists::read(list) {
@@ -242,6 +277,7 @@ fn another<'a>(tree: &'a Tree, images: &Images, list: &Path) -> Option<&'a Path>
     let text = tree.with_extension("txt");
     let others = text.chain(tree.with_extension("json"));
     let others = others.filter(|path| *path != list && small(path) && !lists::is_registered(path));
+    let others = others.filter(|path| tree.refuse_link_out(path).is_ok());
     others.take(MOST).find(|path| {
         lists::read(path).is_ok_and(|listed| {
             let mut tiles = listed.tiles.iter();
@@ -274,6 +310,7 @@ fn refuse_project_alone(tree: &Tree, images: &Images) -> Result<(), ReplayError>
 /// Projects of TrakEM2.
 fn projects(tree: &Tree) -> impl Iterator<Item = &Path> {
     let files = tree.with_extension("xml").filter(small);
+    let files = files.filter(|path| tree.refuse_link_out(path).is_ok());
     files.filter(|path| lists::is_project(path))
 }
 
@@ -294,26 +331,34 @@ fn with_solution(
         // Names that mean several tiles cannot be looked up in a solution.
         return Ok(unsolved);
     }
-    let mut solutions = Vec::from_iter(listed.solution);
+    let mut solutions = Vec::from_iter(listed.solution.clone());
     for project in projects(tree) {
         solutions.push(Solution::read(project)?);
     }
-    match best(&wanted, &unsolved.tiles, solutions) {
+    match best(
+        &wanted,
+        &unsolved.tiles,
+        solutions,
+        listed.solution.as_ref(),
+    ) {
         None => Ok(unsolved),
         Some(best) => Acquisition::new(folder, images, list, &listed.tiles, Some(&best)),
     }
 }
 
-/// The solution that counts for all these tiles, if there is one.
+/// The solution that counts for all these tiles, if there is one; else the list's `own`, if it knows some of them. Others
+/// that know some only are about other tiles, which happen to have such names.
 pub(crate) fn best(
     wanted: &BTreeSet<&str>,
     tiles: &[RawTile],
     solutions: Vec<Solution>,
+    own: Option<&Solution>,
 ) -> Option<Solution> {
+    let has = |solution: &Solution, name: &str| solution.transforms.contains_key(name);
     let mut best: Option<Solution> = None;
     for solution in solutions {
-        let has = |name: &&str| solution.transforms.contains_key(*name);
-        if !wanted.iter().all(has) || !refines(tiles, &solution) {
+        let all = wanted.iter().all(|name| has(&solution, name));
+        if !all || !refines(tiles, &solution) {
             continue;
         }
         if best
@@ -323,7 +368,8 @@ pub(crate) fn best(
             best = Some(solution);
         }
     }
-    best
+    let in_part = |own: &&Solution| wanted.iter().any(|name| has(own, name)) && refines(tiles, own);
+    best.or_else(|| own.filter(in_part).cloned())
 }
 
 /// Whether a solution says anything that the stage did not.

@@ -9,7 +9,9 @@ use glam::DVec2;
 use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
 use saccade_archive::acquisition::tile_specs::{self, TileSpec};
 use saccade_archive::acquisition::trakem2::{self, Patch};
-use saccade_archive::acquisition::{AcquisitionError, tile_configuration};
+use saccade_archive::acquisition::{
+    AcquisitionError, readable, refuse_link_out, tile_configuration,
+};
 use saccade_core::transform::{SectionFromTile, TilePoint};
 
 /// Where registration says that tiles lie.
@@ -25,6 +27,9 @@ impl Solution {
     /// Of a TrakEM2 project.
     pub(crate) fn read(path: &Path) -> Result<Self, AcquisitionError> {
         let patches = trakem2::read(path)?;
+        if let Some(left_out) = trakem2::left_out(&patches, path) {
+            log::warn!("{left_out}");
+        }
         let named = patches
             .iter()
             .map(|p: &Patch| (p.name().to_owned(), p.transform));
@@ -73,6 +78,7 @@ pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
                     solution: None,
                 });
             }
+            refuse_link_out(&registered)?;
             let solution = match tile_configuration::read(&registered) {
                 Ok(tiles) => Some(of_corners(&registered, &tiles)),
                 Err(AcquisitionError::Read { source, .. })
@@ -100,7 +106,7 @@ pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
 /// Whether Fiji's plugins call a file so, or it holds lines like theirs.
 fn is_configuration(path: &Path) -> bool {
     let text = fs::read(path).unwrap_or_default();
-    let text = String::from_utf8_lossy(&text);
+    let text = readable(&text);
     is_called_configuration(path) || text.lines().any(|line| configured(line).is_some())
 }
 
@@ -120,7 +126,7 @@ fn configured(line: &str) -> Option<&str> {
 /// there. Prose and tables of other things have none.
 pub(super) fn is_meant(path: &Path, images: &Images) -> bool {
     let text = fs::read(path).unwrap_or_default();
-    let text = String::from_utf8_lossy(&text);
+    let text = readable(&text);
     if path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("json"))
@@ -162,7 +168,7 @@ pub(super) fn is_certain(path: &Path, tiles: &[ListedTile]) -> bool {
 /// Whether a file is a project of TrakEM2 with images, readable or not.
 pub(crate) fn is_project(path: &Path) -> bool {
     let text = fs::read(path).unwrap_or_default();
-    text.windows(8).any(|word| word == b"t2_patch")
+    readable(&text).contains("t2_patch")
 }
 
 fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {

@@ -5,10 +5,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
+use saccade_archive::storage::{SystemDisk, write_whole};
 use serde_json::{Map, Value, json};
 
 use super::SimulateConfig;
-use super::write::part_of;
 
 /// The settings that determine the tiles, by name. Rate and corrections are none of them: they say
 /// when something is written, not what.
@@ -101,10 +101,8 @@ impl Settings {
 
     /// Writes them into a file, whole or not at all.
     pub(crate) fn write_to(&self, path: PathBuf) -> Result<(), AcquisitionError> {
-        let part = part_of(&path);
         let text = serde_json::to_vec_pretty(&self.0).expect("JSON becomes text");
-        fs::write(&part, text)
-            .and_then(|()| fs::rename(&part, &path))
+        write_whole(&SystemDisk, &path, &text)
             .map_err(|source| AcquisitionError::Write { source, path })
     }
 

@@ -1,12 +1,15 @@
 //! The list of records that a watch writes, by one process at a time.
 
+use std::collections::VecDeque;
 use std::fs::{self, File, TryLockError};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use saccade_archive::acquisition::{AcquisitionError, Record, RecordReader, RecordWriter};
+use saccade_archive::storage::{Disk as _, SystemDisk};
 
-use super::WatchError;
+use super::stamps::Stamps;
+use super::{Untold, WatchError};
 
 /// Name of the file that is locked while a process writes the list.
 const LOCK: &str = "lock";
@@ -40,6 +43,7 @@ impl Append for RecordWriter {
 impl List {
     /// The list in a folder; `None` while another process has it.
     pub(super) fn open(folder: &Path) -> Result<Option<Self>, WatchError> {
+        use io::ErrorKind::{InvalidInput, Unsupported};
         let failed = |source, path: &Path| WatchError::Write {
             source,
             path: path.to_owned(),
@@ -50,15 +54,25 @@ impl List {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => return Ok(None),
             // Some shares know no locks: there, who starts two is told twice.
-            Err(TryLockError::Error(e)) if e.kind() == io::ErrorKind::Unsupported => {
+            Err(TryLockError::Error(e)) if e.kind() == Unsupported => {
                 log::warn!("two processes that watch the same folder would not be noticed: {e}");
             }
             Err(TryLockError::Error(e)) => return Err(failed(e, &path)),
         }
         let path = folder.join(RecordReader::FILE);
         cut_unfinished(&path).map_err(|e| failed(e, &path))?;
+        let records = RecordWriter::open(folder)?;
+        // Records whose file loses its name at a power cut are lost, too, with what was acknowledged of them.
+        for folder in [Some(folder), folder.parent()].into_iter().flatten() {
+            match SystemDisk.sync_dir(folder) {
+                Err(e) if !matches!(e.kind(), InvalidInput | Unsupported) => {
+                    return Err(failed(e, folder));
+                }
+                Ok(()) | Err(_) => {}
+            }
+        }
         Ok(Some(Self {
-            records: Box::new(RecordWriter::open(folder)?),
+            records: Box::new(records),
             path,
             unsynced: false,
             _lock: lock,
@@ -90,6 +104,31 @@ impl List {
     pub(super) fn replace(&mut self, records: Box<dyn Append + Send>) {
         self.records = records;
     }
+}
+
+/// Writes what is to be told, if this process is the one that writes; how much it was. What cannot be written is kept.
+pub(super) fn tell(
+    list: Option<&mut List>,
+    untold: &mut VecDeque<Untold>,
+    stamps: &mut Stamps,
+) -> Result<u64, AcquisitionError> {
+    let Some(list) = list else {
+        return Ok(0);
+    };
+    let (mut told, mut seen) = (0, Vec::new());
+    let written = loop {
+        let Some((record, stamp)) = untold.front() else {
+            break list.sync();
+        };
+        if let Err(e) = list.append(record) {
+            break Err(e);
+        }
+        seen.extend(*stamp);
+        untold.pop_front();
+        told += 1;
+    };
+    stamps.add(&seen);
+    written.map(|()| told)
 }
 
 /// Takes away the end of a line that was never written whole. Nobody reads it before that.

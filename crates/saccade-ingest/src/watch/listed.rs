@@ -4,7 +4,11 @@
 //! [`ListWatch`] keeps an acquisition archive of its own, as [`Watch`](super::Watch) does of a bare folder. The list is
 //! read again whenever its file has changed and rests: tiles that are new in it are told of once their image is there,
 //! those that lie elsewhere get a transform, those that are in it no more are deleted. Where registration has found
-//! better places, in Fiji's twin of the list, in Render's transforms or in a TrakEM2 project, these count.
+//! better places, in Fiji's twin of the list, in Render's transforms or in a TrakEM2 project, these count. A twin may know
+//! some of the tiles only: the others stay where the list has them.
+//!
+//! A list that names tiles no more may be half of one that is being written. Nothing of it counts before it has rested for
+//! [`ListConfig::drop_after`].
 //!
 //! # Frame
 //!
@@ -33,8 +37,9 @@ use super::list::List;
 use super::stamp::{Seen, Stamp};
 use super::stamps::Stamps;
 use super::{Folders, Next, Untold, WatchError};
+use crate::held_up::HeldUp;
 use frame::Frame;
-use index::{Index, base, key};
+use index::{Index, Sought, base, key};
 use source::{Adopted, Files};
 
 mod config;
@@ -120,7 +125,19 @@ pub struct ListWatch<F> {
     missing: BTreeSet<Arc<str>>,
     /// When one of them came last.
     progress: SystemTime,
-    missing_told: bool,
+    /// What was said of them.
+    missing_said: Option<String>,
+    /// Those of which it is not clear which image is theirs.
+    unclear: BTreeSet<Arc<str>>,
+    /// How many that were when it was said, and how.
+    unclear_said: Option<(usize, String)>,
+    /// What is said of tiles that the list names no more, until they are deleted.
+    dropping: Option<String>,
+    /// How many tiles registration does not know, as it was said last.
+    unsolved_said: usize,
+    /// Whether it was said why a solution is not used.
+    unused_said: bool,
+    held_up: HeldUp,
     unread: VecDeque<Unread>,
     /// Records that could not be written yet.
     untold: VecDeque<Untold>,
@@ -177,7 +194,13 @@ impl<F: Folders> ListWatch<F> {
             by_name: HashMap::new(),
             missing: BTreeSet::new(),
             progress: now,
-            missing_told: false,
+            missing_said: None,
+            unclear: BTreeSet::new(),
+            unclear_said: None,
+            dropping: None,
+            unsolved_said: 0,
+            unused_said: false,
+            held_up: HeldUp::default(),
             unread: VecDeque::new(),
             untold: VecDeque::new(),
             seen: HashMap::new(),
@@ -197,6 +220,13 @@ impl<F: Folders> ListWatch<F> {
     /// The folder whose images are listed, see [`IngestOptions::linked`](crate::ingest::IngestOptions::linked).
     pub fn folder(&self) -> &Path {
         &self.folder
+    }
+
+    /// Tells what it waits for.
+    #[must_use]
+    pub fn telling(mut self, held_up: HeldUp) -> Self {
+        self.held_up = held_up;
+        self
     }
 
     /// Where the records are kept: what [`crate::ingest::run`] follows, once the volume [`is_known`](Self::is_known).
@@ -219,7 +249,7 @@ impl<F: Folders> ListWatch<F> {
         const SHOWN: usize = 3;
         let odd = self.index.odd();
         let (mut absent, mut first_absent, mut strange, mut whys) = (0_usize, None, 0, Vec::new());
-        for tile in &self.missing {
+        for tile in self.missing.difference(&self.unclear) {
             let Some(wanted) = self.tiles.get(tile).and_then(|tile| tile.wanted.as_ref()) else {
                 continue;
             };
@@ -253,7 +283,26 @@ impl<F: Folders> ListWatch<F> {
                 self.folder.display()
             ));
         }
+        said.extend(self.unclear());
         (!said.is_empty()).then(|| said.join("; "))
+    }
+
+    /// Which images are in several folders, in words.
+    fn unclear(&self) -> Option<String> {
+        let mut of = self.unclear.iter().filter_map(|tile| {
+            let wanted = self.tiles.get(tile)?.wanted.as_ref()?;
+            match self.index.sought(&wanted.file) {
+                Sought::Several(places) => Some((&wanted.file, places)),
+                Sought::There(_) | Sought::Missing => None,
+            }
+        });
+        let (file, [one, other]) = of.next()?;
+        let (count, all, list) = (self.unclear.len(), self.tiles.len(), &self.config.list);
+        Some(format!(
+            "{count} of the {all} images that the list names are in several folders, such as {file:?}, which may be \
+             {one:?} or {other:?}; name them with their folders in the list: {}",
+            list.display()
+        ))
     }
 
     /// Takes over what was settled before, by whichever process.
@@ -293,6 +342,12 @@ impl<F: Folders> ListWatch<F> {
         }
         if !self.index.is_whole() {
             return Ok((before, next));
+        }
+        if next == Next::Again {
+            // One of several may be gone.
+            for tile in self.unclear.clone() {
+                self.look_for(&tile, now);
+            }
         }
         if !std::mem::replace(&mut self.whole, true) {
             for tile in self.missing.clone() {
@@ -363,9 +418,17 @@ impl<F: Folders> ListWatch<F> {
         let Some(wanted) = self.tiles.get_mut(tile).and_then(|t| t.wanted.as_mut()) else {
             return;
         };
-        if self.whole && self.index.find(&wanted.file).is_some() {
+        let sought = match self.whole {
+            true => self.index.find(&wanted.file),
+            false => Sought::Missing,
+        };
+        match sought {
+            Sought::Several(_) => _ = self.unclear.insert(Arc::clone(tile)),
+            Sought::There(_) | Sought::Missing => _ = self.unclear.remove(tile),
+        }
+        if let Sought::There(_) = sought {
             self.missing.remove(tile);
-            (self.progress, self.missing_told) = (now, false);
+            (self.progress, self.missing_said) = (now, None);
             wanted.image = Image::Unread;
             self.unread.push_back(Unread {
                 tile: Arc::clone(tile),
@@ -428,18 +491,27 @@ impl<F: Folders> ListWatch<F> {
         }
     }
 
-    /// Once, when no image has come for a while.
+    /// Once, when no image has come for a while; that it is not clear which one is meant, at once.
     fn say_what_is_missing(&mut self, now: SystemTime) {
         const AFTER: Duration = Duration::from_secs(30);
+        let count = self.unclear.len();
+        if self.unclear_said.as_ref().map_or(0, |(said, _)| *said) != count {
+            self.unclear_said = self.unclear().map(|said| (count, said));
+            if let Some((_, said)) = &self.unclear_said {
+                log::warn!("{said}");
+            }
+        }
         let rests = now
             .duration_since(self.progress)
             .is_ok_and(|age| age > AFTER);
-        if rests
-            && !self.missing_told
+        if self.missing.is_empty() {
+            self.missing_said = None;
+        } else if rests
+            && self.missing_said.is_none()
             && let Some(missing) = self.missing()
         {
             log::warn!("{missing}; they are waited for");
-            self.missing_told = true;
+            self.missing_said = Some(missing);
         }
     }
 }

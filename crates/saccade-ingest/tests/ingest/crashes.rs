@@ -115,6 +115,11 @@ async fn storages_that_leave_a_step_out_are_found_out() {
     }
 }
 
+/// The seed that is asked for, or another each time.
+pub(crate) fn seed() -> u64 {
+    asked_for().0
+}
+
 /// Seed, and the one history to repeat.
 fn asked_for() -> (u64, Option<u64>) {
     let number = |text: &str| {

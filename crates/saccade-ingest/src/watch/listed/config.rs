@@ -9,6 +9,7 @@ use saccade_archive::acquisition::AcquisitionError;
 use saccade_core::volume::Dtype;
 
 use super::super::WatchError;
+use super::super::looking::Passes;
 use super::source;
 use crate::replay::ReplayError;
 
@@ -34,9 +35,11 @@ pub struct ListConfig {
     pub scale: f64,
     /// Pause between looks.
     pub poll: Duration,
-    /// For how long the list must not have changed before it is read; four times as long before tiles are
-    /// deleted that it names no more.
+    /// For how long the list must not have changed before it is read.
     pub rest: Duration,
+    /// For how long it must not have changed before it is read if it names tiles no more: who writes it anew, slowly or
+    /// with pauses, has not come to them yet.
+    pub drop_after: Duration,
     /// Folders and files asked per look.
     pub budget: usize,
 }
@@ -44,6 +47,9 @@ pub struct ListConfig {
 impl ListConfig {
     /// For how long a list rests, if nothing else is said.
     pub const REST: Duration = Duration::from_secs(1);
+
+    /// For how long a list rests that names tiles no more, if nothing else is said.
+    pub const DROP_AFTER: Duration = Duration::from_secs(30);
 
     /// Looks whether the list can be read; nothing is made yet.
     ///
@@ -136,19 +142,15 @@ impl From<AcquisitionError> for ListError {
 }
 
 impl ListError {
-    /// Whether somebody may be about to mend it.
-    pub(super) fn may_pass(&self) -> bool {
+    /// Whether a later look may succeed.
+    pub(super) fn passes(&self) -> Passes {
         match self {
-            Self::Watch(WatchError::Look { .. })
-            | Self::List { .. }
-            | Self::Gone { .. }
-            | Self::Empty { .. }
-            | Self::NoImages { .. } => true,
-            Self::Watch(_) | Self::Sections { .. } | Self::Frame(_) => false,
+            Self::Watch(error) => Passes::of(error),
+            // Somebody may be about to mend it.
+            Self::List { .. } | Self::Gone { .. } | Self::Empty { .. } | Self::NoImages { .. } => {
+                Passes::Soon
+            }
+            Self::Sections { .. } | Self::Frame(_) => Passes::Never,
         }
-    }
-
-    pub(super) fn is_full(&self) -> bool {
-        matches!(self, Self::Watch(e) if e.is_full())
     }
 }

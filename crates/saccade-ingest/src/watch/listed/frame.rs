@@ -7,12 +7,13 @@ use std::path::{Path, PathBuf};
 
 use glam::{DVec2, UVec2, UVec3};
 use saccade_archive::acquisition::AcquisitionInfo;
+use saccade_archive::catalog::place;
 use saccade_archive::image::{read_bits, read_size};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, MAX_EXTENT};
 
 use super::super::{LINK, SETTINGS, WatchError, is_unused};
-use super::index::Index;
+use super::index::{Index, Sought};
 use super::source::{Adopted, Listing, adopt, line_of, raw};
 use super::{ListConfig, ListError};
 use crate::replay::ReplayError;
@@ -127,6 +128,11 @@ impl Frame {
         Ok(())
     }
 
+    /// Whether a tile would lie in the volume.
+    pub(super) fn holds(&self, section: u32, size: UVec2, transform: SectionFromTile) -> bool {
+        place(self.info.extent, section, size, transform).is_some()
+    }
+
     /// Where a tile lies in the volume, from where it lies in the list.
     pub(super) fn place(&self, listed: SectionFromTile) -> SectionFromTile {
         let moved = listed.shifted(-self.origin);
@@ -186,7 +192,7 @@ pub(super) fn begin(
     let spans = config.extent.is_none() || config.origin.is_none();
     let asks = spans || config.dtype.is_none();
     for (tile, size) in tiles.iter().zip(&mut sizes).filter(|_| asks) {
-        let Some(image) = index.find(&tile.file) else {
+        let Sought::There(image) = index.find(&tile.file) else {
             continue;
         };
         let image = folder.join(image);

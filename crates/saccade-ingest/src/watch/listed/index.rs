@@ -41,8 +41,10 @@ pub(super) struct Index {
     /// The folder that is asked next.
     at: usize,
     listing: Option<Listing>,
-    /// The folder of each file, by the hash of the file's name: of several, the first by path.
+    /// A folder of each file, by the hash of the file's name.
     files: HashMap<u64, usize>,
+    /// All folders of names that are in several.
+    several: HashMap<u64, BTreeSet<usize>>,
     /// Files that may be projects of TrakEM2, below the root.
     projects: BTreeSet<PathBuf>,
     /// What was looked for and is nothing to read, below the root.
@@ -51,6 +53,16 @@ pub(super) struct Index {
     odd_at: PathBuf,
     changed: bool,
     went_round: bool,
+}
+
+/// What is found under a name.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Sought {
+    /// The image, below the root.
+    There(String),
+    /// Images in several folders, of which the list does not say which one it means; two of them.
+    Several([PathBuf; 2]),
+    Missing,
 }
 
 /// The hash by which a name or path is known.
@@ -69,6 +81,15 @@ fn oddity(path: &Path) -> Option<&'static str> {
         (_, Err(e)) if is_gone(&e) => None,
         (_, Err(_)) => Some("not to be looked at"),
     }
+}
+
+/// How many folders two paths have in common from their ends on.
+fn likeness(path: &Path, file: &str) -> usize {
+    let folders = path.components().rev().skip(1);
+    let named = file.rsplit(['/', '\\']).skip(1);
+    let both = folders.zip(named);
+    both.take_while(|(folder, named)| folder.as_os_str() == *named)
+        .count()
 }
 
 /// A path's last part; lists are written by programs that separate folders by either slash.
@@ -90,6 +111,7 @@ impl Index {
             at: 0,
             listing: None,
             files: HashMap::new(),
+            several: HashMap::new(),
             projects: BTreeSet::new(),
             odd: BTreeSet::new(),
             odd_at: PathBuf::new(),
@@ -107,28 +129,56 @@ impl Index {
         self.projects.iter().map(PathBuf::as_path)
     }
 
-    /// The image that a list calls `file`, below the root: at that path, else by name alone.
-    pub(super) fn find(&mut self, file: &str) -> Option<String> {
+    /// The image that a list calls `file`: at that path, else by name alone. Of several of that name the one whose
+    /// folders are most like those that the list names; none, if that could be several.
+    pub(super) fn sought(&self, file: &str) -> Sought {
+        let there = |path: &Path| match path.to_str() {
+            Some(path) => Sought::There(path.to_owned()),
+            None => Sought::Missing,
+        };
         let named = image_path(Path::new(""), file);
         if let Some(named) = named.filter(|path| self.root.join(path).is_file()) {
             let plain: PathBuf = named.components().collect();
-            return plain.to_str().map(ToOwned::to_owned);
+            return there(&plain);
         }
-        let name = base(file);
-        let folder = *self.files.get(&key(name))?;
-        let path = self.folders[folder].path.join(name);
-        if self.root.join(&path).is_file() {
-            return path.to_str().map(ToOwned::to_owned);
+        let (name, hash) = (base(file), key(base(file)));
+        let Some(first) = self.files.get(&hash) else {
+            return Sought::Missing;
+        };
+        let one = BTreeSet::from([*first]);
+        let folders = self.several.get(&hash).unwrap_or(&one).iter();
+        let paths = folders.map(|folder| self.folders[*folder].path.join(name));
+        let paths = paths.filter(|path| self.root.join(path).is_file());
+        let mut paths: Vec<(usize, PathBuf)> =
+            paths.map(|path| (likeness(&path, file), path)).collect();
+        let best = paths.iter().map(|(like, _)| *like).max().unwrap_or(0);
+        paths.retain(|(like, _)| *like == best);
+        paths.sort();
+        match &paths[..] {
+            [] => Sought::Missing,
+            [(_, path)] => there(path),
+            [(_, one), (_, other), ..] => Sought::Several([one.clone(), other.clone()]),
         }
-        // It is gone, or nothing to read; another of its name may be there.
-        self.files.remove(&key(name));
-        if oddity(&self.root.join(&path)).is_some() {
-            self.odd.insert(path);
+    }
+
+    /// The same; what is not where it was is looked for anew.
+    pub(super) fn find(&mut self, file: &str) -> Sought {
+        let found = self.sought(file);
+        let (name, hash) = (base(file), key(base(file)));
+        if found == Sought::Missing
+            && let Some(folder) = self.files.remove(&hash)
+        {
+            // It is gone, or nothing to read; another of its name may be there.
+            self.several.remove(&hash);
+            let path = self.folders[folder].path.join(name);
+            if oddity(&self.root.join(&path)).is_some() {
+                self.odd.insert(path);
+            }
+            for folder in &mut self.folders {
+                folder.listed = None;
+            }
         }
-        for folder in &mut self.folders {
-            folder.listed = None;
-        }
-        None
+        found
     }
 
     /// Whether the image that was found is the one that a list calls `file`: as long as it has that name, and there is
@@ -275,9 +325,10 @@ impl Index {
             }
             self.odd.remove(&path);
         }
-        let known = self.files.entry(key(&name)).or_insert(at);
-        if self.folders[at].path.join(&name) < self.folders[*known].path.join(&name) {
-            *known = at;
+        let known = *self.files.entry(key(&name)).or_insert(at);
+        if known != at {
+            let several = self.several.entry(key(&name)).or_default();
+            several.extend([known, at]);
         }
         if path
             .extension()
@@ -327,11 +378,18 @@ mod tests {
         );
         assert!(index.is_whole());
         let mut find = |file: &str| index.find(file);
-        assert_eq!(find("z/a.tif").unwrap(), "z/a.tif");
-        assert_eq!(find("./z/../a.tif"), Some("deep/er/a.tif".to_owned()));
-        assert_eq!(find("/scope/x/a.tif").unwrap(), "deep/er/a.tif");
-        assert_eq!(find("C:\\x\\b.tif").unwrap(), "b.tif");
-        assert_eq!(find("c.tif"), None);
+        let there = |path: &str| Sought::There(path.to_owned());
+        // Which of two is meant, only their folders can say.
+        let several = Sought::Several(["deep/er/a.tif", "z/a.tif"].map(PathBuf::from));
+        assert_eq!(find("z/a.tif"), there("z/a.tif"));
+        for unclear in ["a.tif", "./z/../a.tif", "/scope/x/a.tif", "x\\a.tif"] {
+            assert_eq!(find(unclear), several, "{unclear}");
+        }
+        assert_eq!(find("/scope/z/a.tif"), there("z/a.tif"));
+        assert_eq!(find("C:\\scope\\deep\\er\\a.tif"), there("deep/er/a.tif"));
+        assert_eq!(find("/scope/er/a.tif"), there("deep/er/a.tif"));
+        assert_eq!(find("C:\\x\\b.tif"), there("b.tif"));
+        assert_eq!(find("c.tif"), Sought::Missing);
         assert_eq!(
             index.projects().collect::<Vec<_>>(),
             [Path::new("deep/p.XML")]
@@ -340,9 +398,14 @@ mod tests {
         // One that goes away uncovers the next; one that comes is met.
         fs::remove_file(folder.path().join("deep/er/a.tif")).unwrap();
         write("new/c.tif");
-        assert_eq!(index.find("a.tif"), None);
+        assert_eq!(index.find("a.tif"), there("z/a.tif"));
         assert!(round(&mut index).contains(&"new/c.tif".to_owned()));
-        assert_eq!(index.find("a.tif").unwrap(), "z/a.tif");
-        assert_eq!(index.find("c.tif").unwrap(), "new/c.tif");
+        assert_eq!(index.find("a.tif"), there("z/a.tif"));
+        assert_eq!(index.find("c.tif"), there("new/c.tif"));
+        fs::remove_file(folder.path().join("z/a.tif")).unwrap();
+        write("new/a.tif");
+        assert_eq!(index.find("a.tif"), Sought::Missing);
+        round(&mut index);
+        assert_eq!(index.find("a.tif"), there("new/a.tif"));
     }
 }

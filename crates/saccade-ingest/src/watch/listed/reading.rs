@@ -26,11 +26,21 @@ impl<F: Folders> ListWatch<F> {
                 let path = self.config.list.clone();
                 return Err(ListError::Gone { path });
             }
-            State::Same => return self.troubled(),
-            State::Changed(age) if age < self.config.rest => return Ok(true),
+            State::Same => {
+                self.dropping = None;
+                return self.troubled();
+            }
+            State::Changed(age) if age < self.config.rest => {
+                self.dropping = None;
+                return Ok(true);
+            }
+            // Nothing but time will tell whether it is whole.
+            State::Changed(age) if self.dropping.is_some() && age < self.config.drop_after => {
+                return Ok(true);
+            }
             State::Changed(age) => age,
         };
-        self.trouble = None;
+        (self.trouble, self.dropping) = (None, None);
         let listing = match source::read(&self.config.list) {
             Ok(listing) if listing.tiles.is_empty() => {
                 self.trouble = Some(Trouble::Empty);
@@ -42,10 +52,22 @@ impl<F: Folders> ListWatch<F> {
         };
         let known: HashSet<&str> = listing.tiles.iter().map(|tile| &*tile.name).collect();
         let dropped =
-            |(name, tile): (&Arc<str>, &Tile)| tile.told.is_some() && !known.contains(&**name);
+            |(name, tile): &(&Arc<str>, &Tile)| tile.told.is_some() && !known.contains(&***name);
         // Half of a list looks like a list.
-        if age < 4 * self.config.rest && self.tiles.iter().any(dropped) {
-            return Ok(true);
+        if age < self.config.drop_after {
+            let mut dropped = self.tiles.iter().filter(dropped);
+            if let Some((first, _)) = dropped.next() {
+                let said = format!(
+                    "the list names {} tiles no more, such as {first:?}; in case it is being written, it is read once it \
+                     has not changed for {} s: {}",
+                    1 + dropped.count(),
+                    self.config.drop_after.as_secs_f64(),
+                    self.config.list.display()
+                );
+                log::warn!("{said}");
+                self.dropping = Some(said);
+                return Ok(true);
+            }
         }
         if self.frame.is_none() {
             let begun = frame::begin(
@@ -80,6 +102,7 @@ impl<F: Folders> ListWatch<F> {
             }
         }
         self.say_shift();
+        self.say_unsolved(&listing);
         self.files.are_read();
         self.enter(listing, now);
         Ok(false)
@@ -134,6 +157,35 @@ impl<F: Folders> ListWatch<F> {
         );
     }
 
+    /// Says how many tiles registration does not know, when that changes, or why what it found is not used.
+    fn say_unsolved(&mut self, listing: &Listing) {
+        let Some(adopted) = &self.adopted else {
+            if !self.unused_said
+                && let Some(why) = source::unused(listing)
+            {
+                log::warn!("{why}");
+                self.unused_said = true;
+            }
+            return;
+        };
+        let mut unsolved = listing.tiles.iter().filter(|t| adopted.place(t).is_none());
+        let first = unsolved.next();
+        let count = unsolved.count() + usize::from(first.is_some());
+        if count == std::mem::replace(&mut self.unsolved_said, count) {
+            return;
+        }
+        let path = adopted.solution.path.display();
+        match first {
+            Some(first) => log::warn!(
+                "registration knows {} of the {} tiles; the others, such as {:?}, lie where the list has them: {path}",
+                listing.tiles.len() - count,
+                listing.tiles.len(),
+                first.name
+            ),
+            None => log::warn!("registration knows all tiles now: {path}"),
+        }
+    }
+
     fn unreadable(&mut self, error: AcquisitionError) -> Result<bool, ListError> {
         self.trouble = Some(Trouble::Unreadable(Arc::new(error)));
         self.files.are_read();
@@ -159,6 +211,7 @@ impl<F: Folders> ListWatch<F> {
             tile.wanted = None;
         }
         self.missing.clear();
+        self.unclear.clear();
         let before = std::mem::take(&mut self.unread).into_iter();
         let mut before: HashMap<_, _> =
             before.map(|unread| (unread.tile.clone(), unread)).collect();
@@ -179,9 +232,12 @@ impl<F: Folders> ListWatch<F> {
             }
             let tile = self.tiles.entry(Arc::clone(&name)).or_default();
             let image = match &mut tile.told {
+                // One that lay outside of the volume was not taken in: it is told of anew, image and all.
                 Some(told)
                     if self.index.is_still(&told.file, &named.file)
-                        && (told.section, told.size == UVec2::ZERO) == (section, false) =>
+                        && (told.section, told.size == UVec2::ZERO) == (section, false)
+                        && (frame.holds(section, told.size, told.transform)
+                            || same_place(told.transform, transform)) =>
                 {
                     if !same_place(told.transform, transform) {
                         told.transform = transform;
@@ -218,6 +274,9 @@ impl<F: Folders> ListWatch<F> {
             }
             tile.wanted.is_some()
         });
+        if self.missing_said.is_some() {
+            self.missing_said = self.missing();
+        }
     }
 }
 

@@ -11,10 +11,10 @@ use saccade_archive::acquisition::{
 };
 use saccade_archive::image::read_size;
 
-use super::super::list::List;
+use super::super::list::{self, List};
 use super::super::stamp::Seen;
 use super::super::{Folders, LINK, PATIENCE, file_name};
-use super::index::{base, key};
+use super::index::{Sought, base, key};
 use super::{Image, ListError, ListWatch, Tile, Told};
 
 impl<F: Folders> ListWatch<F> {
@@ -80,24 +80,8 @@ impl<F: Folders> ListWatch<F> {
 
     /// Writes what is to be told; how much it was. What cannot be written is kept.
     pub(super) fn tell(&mut self) -> Result<u64, ListError> {
-        let mut told = 0;
-        if let Some(list) = &mut self.records {
-            let mut stamps = Vec::new();
-            let written = loop {
-                let Some((record, stamp)) = self.untold.front() else {
-                    break list.sync();
-                };
-                if let Err(e) = list.append(record) {
-                    break Err(e);
-                }
-                stamps.extend(*stamp);
-                self.untold.pop_front();
-                told += 1;
-            };
-            self.stamps.add(&stamps);
-            written?;
-        }
-        Ok(told)
+        let (list, untold, stamps) = (&mut self.records, &mut self.untold, &mut self.stamps);
+        Ok(list::tell(list.as_mut(), untold, stamps)?)
     }
 
     /// Reads the sizes of images that were found, and tells of their tiles.
@@ -116,7 +100,7 @@ impl<F: Folders> ListWatch<F> {
             else {
                 continue;
             };
-            let Some(file) = self.index.find(&wanted.file) else {
+            let Sought::There(file) = self.index.find(&wanted.file) else {
                 let tile = unread.tile;
                 self.look_for(&tile, now);
                 continue;

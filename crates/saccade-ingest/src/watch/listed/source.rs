@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use glam::{DVec2, UVec2};
-use saccade_archive::acquisition::{AcquisitionError, tile_configuration, trakem2};
+use saccade_archive::acquisition::{
+    AcquisitionError, refuse_link_out, tile_configuration, trakem2,
+};
 use saccade_core::transform::SectionFromTile;
 
 use super::super::{Folders, Stamp};
@@ -53,6 +55,9 @@ pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
         .is_some_and(|e| e.eq_ignore_ascii_case("xml"));
     let (tiles, own): (Vec<_>, _) = if is_xml {
         let patches = trakem2::read(path)?;
+        if let Some(left_out) = trakem2::left_out(&patches, path) {
+            log::warn!("{left_out}");
+        }
         let tiles = patches.into_iter().map(|patch| {
             let stem = patch.name().to_owned();
             (stem, patch.file, patch.section, patch.transform)
@@ -163,15 +168,36 @@ pub(super) fn adopt(
     let small = |path: &&PathBuf| {
         let meta = path.metadata();
         meta.is_ok_and(|meta| meta.is_file() && meta.len() <= LARGEST_LIST)
+            && refuse_link_out(path).is_ok()
     };
     for project in projects.iter().filter(small).filter(|p| is_project(p)) {
         solutions.push(Solution::read(project)?);
     }
-    let Some(solution) = best(&wanted, &raw, solutions) else {
+    let Some(solution) = best(&wanted, &raw, solutions, listing.own.as_ref()) else {
         return Ok(None);
     };
     let offset = offset(&solution, raw).unwrap_or_default();
     Ok(Some(Adopted { solution, offset }))
+}
+
+/// Why what the list's own program found is not used, where that is not plain to see.
+pub(super) fn unused(listing: &Listing) -> Option<String> {
+    let own = listing.own.as_ref()?;
+    let mut known = HashSet::new();
+    let path = own.path.display();
+    if let Some(twice) = listing.tiles.iter().find(|tile| !known.insert(&tile.stem)) {
+        return Some(format!(
+            "registration is not used: several tiles of the list are called {:?}, and it does not say which one it means; \
+             give the images different names: {path}",
+            twice.stem
+        ));
+    }
+    let none = !listing
+        .tiles
+        .iter()
+        .any(|tile| own.transforms.contains_key(&tile.stem));
+    (none && !listing.tiles.is_empty())
+        .then(|| format!("registration is not used: it names none of the list's images: {path}"))
 }
 
 /// How far a solution's frame is from the list's \[pixels\]; `None` if it has none of the tiles.

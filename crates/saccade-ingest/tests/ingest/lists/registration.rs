@@ -1,0 +1,154 @@
+//! Better places than the list's own, that come later.
+
+use std::fs;
+
+use glam::DVec2;
+use saccade_ingest::Cancel;
+use saccade_ingest::replay::{Input, detect};
+use saccade_ingest::watch::{ListConfig, ListError, Until, follow};
+
+use super::{Scope, config, roomy, write};
+use crate::scope::{archive, seen};
+
+/// Registration that comes later moves what is there, as far as it refines the list, whose frame stays.
+#[tokio::test]
+async fn a_solution_that_comes_later_moves_tiles() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let tiles = |far: f64, b: f64| {
+        let b = far + b;
+        format!(
+            "dim = 2\na.tif; ; ({far}, 0)\nb.tif; ; ({b}, 0)\nc.tif; ; ({}, 0)\n",
+            far + 90.0
+        )
+    };
+    for (seed, name) in (0..).zip(["a", "b", "c"]) {
+        scope.image(name, seed);
+    }
+    let places = || async {
+        let tiles = seen(&archive).await;
+        tiles
+            .values()
+            .map(|tile| tile.transform[4])
+            .collect::<Vec<_>>()
+    };
+    write(&list, tiles(0.0, 45.0));
+    scope.once(config(&list), &archive).await;
+    assert_eq!(places().await, [0.0, 45.0, 90.0]);
+    write(&registered, tiles(1000.0, 46.5));
+    scope.once(config(&list), &archive).await;
+    assert_eq!(places().await, [0.0, 46.5, 90.0]);
+    write(&registered, tiles(1000.0, 44.0));
+    scope.once(config(&list), &archive).await;
+    assert_eq!(places().await, [0.0, 44.0, 90.0]);
+    let records = scope.records();
+    assert_eq!(records.len(), 5, "{records:?}");
+    // Without it, it is not known where they lie.
+    fs::remove_file(&registered).unwrap();
+    let mut watch = scope.watch(config(&list));
+    let error = follow(&mut watch, Until::End, true, &Cancel::new()).unwrap_err();
+    assert!(matches!(error, ListError::List { .. }), "{error}");
+    assert_eq!(scope.records(), records);
+}
+
+/// Fiji begins wherever the first tile is: what counts is how its places differ from the list's.
+#[tokio::test]
+async fn registration_that_begins_elsewhere_is_the_same() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let tiles = |at: [f64; 2], places: &[f64]| {
+        let [x, y] = at;
+        let names = ["a", "b", "c", "d"].iter().zip(places);
+        let lines = names.map(|(name, place)| format!("{name}.tif; ; ({}, {y})\n", x + place));
+        format!("dim = 2\n{}", lines.collect::<String>())
+    };
+    for (seed, name) in (0..).zip(["a", "b", "c", "d"]) {
+        scope.image(name, seed);
+    }
+    let places = || async {
+        let tiles = seen(&archive).await;
+        let places = tiles.values().map(|tile| tile.transform[4..].to_vec());
+        places.collect::<Vec<_>>()
+    };
+    // The list's own corner of the volume stays, whatever registration counts from.
+    let config = || ListConfig {
+        origin: Some(DVec2::new(5.0, 2.0)),
+        ..roomy(&list)
+    };
+    write(&list, tiles([100.0, 50.0], &[0.0, 45.0, 90.0]));
+    write(&registered, tiles([1000.0, 1000.0], &[0.0, 46.5, 90.0]));
+    let want = vec![vec![95.0, 48.0], vec![141.5, 48.0], vec![185.0, 48.0]];
+    scope.once(config(), &archive).await;
+    assert_eq!(places().await, want);
+    let told = scope.records().len();
+    for corner in [[0.0, 0.0], [-700.25, 3e4], [1000.0, 1000.0]] {
+        write(&registered, tiles(corner, &[0.0, 46.5, 90.0]));
+        scope.once(config(), &archive).await;
+        assert_eq!(places().await, want, "{corner:?}");
+    }
+    assert_eq!(scope.records().len(), told, "nothing moved");
+
+    // Others, from elsewhere; and the same while somebody follows.
+    write(&registered, tiles([0.0, 0.0], &[0.0, 44.0, 90.0]));
+    scope.once(config(), &archive).await;
+    let other = vec![vec![95.0, 48.0], vec![139.0, 48.0], vec![185.0, 48.0]];
+    assert_eq!(places().await, other);
+    // One that only knows more moves nothing that is there.
+    write(&list, tiles([100.0, 50.0], &[0.0, 45.0, 90.0, 135.0]));
+    write(&registered, tiles([0.0, 0.0], &[0.0, 44.0, 90.0, 139.0]));
+    scope.once(config(), &archive).await;
+    let all = places().await;
+    assert_eq!((&all[..3], &all[3][..]), (&other[..], &[234.0, 48.0][..]));
+}
+
+/// Fiji may have been given some of the tiles only, or leave out what it cannot place.
+#[tokio::test]
+async fn registration_of_some_tiles_moves_those() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let names = ["a", "b", "c", "d"];
+    for (seed, name) in (0..).zip(names) {
+        scope.image(name, seed);
+    }
+    let tiles = |places: &[(&str, f64)]| {
+        let lines = places
+            .iter()
+            .map(|(name, x)| format!("{name}.tif; ; ({x}, 0)\n"));
+        format!("dim = 2\n{}", lines.collect::<String>())
+    };
+    let plain = [("a", 0.0), ("b", 45.0), ("c", 90.0), ("d", 135.0)];
+    write(&list, tiles(&plain));
+    write(
+        &registered,
+        tiles(&[("a", 1000.0), ("b", 1046.5), ("c", 1090.0)]),
+    );
+    scope.once(config(&list), &archive).await;
+    let places = || async {
+        let tiles = seen(&archive).await;
+        tiles
+            .values()
+            .map(|tile| tile.transform[4])
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(places().await, [0.0, 46.5, 90.0, 135.0]);
+    // One that knows another besides.
+    let all = [("a", 1000.0), ("b", 1046.5), ("c", 1090.0), ("d", 1133.0)];
+    write(&registered, tiles(&all));
+    scope.once(config(&list), &archive).await;
+    assert_eq!(places().await, [0.0, 46.5, 90.0, 133.0]);
+    // It is the same in a replay.
+    write(&registered, tiles(&all[..2]));
+    let Input::Acquisition(replayed) = detect(&scope.path()).unwrap() else {
+        panic!("a list")
+    };
+    let solved: Vec<_> = replayed.tiles.iter().map(|t| t.aligned.is_some()).collect();
+    assert_eq!(solved, [true, true, false, false]);
+    let said = Input::Acquisition(replayed).describe();
+    assert!(said.contains("2 of which are later moved by"), "{said}");
+}
