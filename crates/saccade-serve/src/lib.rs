@@ -74,5 +74,5 @@ mod volumes;
 
 pub use archive::{OfferError, follow_archive, offer_archive};
 pub use server::{Access, Compress, Limits, Options, Origins, ServeError, Server};
-pub use status::{CatalogStatus, DamagedTile, Quarantined, Status, StatusError, StatusSource};
+pub use status::{CatalogStatus, DamagedTile, HeldUp, Quarantined, Status, StatusError, StatusSource};
 pub use volumes::Volumes;

@@ -1,6 +1,7 @@
 //! How a volume is coming along.
 
 use std::sync::Arc;
+use std::time::UNIX_EPOCH;
 
 use futures::future::BoxFuture;
 use saccade_archive::catalog::{Catalog, CatalogError};
@@ -24,6 +25,9 @@ pub struct Status {
     pub queued: Option<u64>,
     /// Transforms whose tile has not come yet; `None` likewise.
     pub early_transforms: Option<u64>,
+    /// What those wait for who take tiles in, the longest first; empty while they go on, or are not there.
+    #[serde(default)]
+    pub held_up: Vec<HeldUp>,
     /// Files that could not be taken in.
     #[serde(default)]
     pub set_aside: u64,
@@ -66,6 +70,17 @@ impl Status {
             ..self
         }
     }
+}
+
+/// Why tiles are not taken in.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct HeldUp {
+    /// Machine and process that wait.
+    pub worker: String,
+    /// What they wait for, in words for people.
+    pub why: String,
+    /// Since when \[s since 1970\].
+    pub since: u64,
 }
 
 /// A file set aside.
@@ -126,7 +141,17 @@ impl CatalogStatus {
             tile: q.tile,
             reason: q.reason,
         };
+        let held_up = self.catalog.held_up(&self.volume).await?;
+        let waits = |held: saccade_archive::catalog::HeldUp| HeldUp {
+            since: held
+                .since
+                .duration_since(UNIX_EPOCH)
+                .map_or(0, |since| since.as_secs()),
+            worker: held.worker,
+            why: held.why,
+        };
         Ok(Status {
+            held_up: held_up.into_iter().map(waits).collect(),
             revision: statistics.revision,
             tiles: Some(statistics.tiles),
             sections: Some(statistics.sections),

@@ -1,11 +1,12 @@
 //! What `saccade ingest` follows: records, or a folder whose file names or list say what lies where.
 
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 use glam::{DVec2, DVec3, UVec3};
-use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo};
+use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, refuse_link_out};
 use saccade_core::volume::Dtype;
 use saccade_ingest::ingest::IngestOptions;
 use saccade_ingest::replay::find_list;
@@ -58,18 +59,18 @@ pub(crate) struct Bare {
     #[arg(long, value_name = "NUMBER", value_parser = scale)]
     pixel: Option<f64>,
 
+    /// For how long a list must not have changed [s] before tiles are deleted that it names no more: who writes it anew,
+    /// slowly or with pauses, may not have come to them [default: 30]
+    #[arg(long, value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..=86_400), conflicts_with = "pattern")]
+    drop_after: Option<u32>,
+
     /// Number of the first section, row and column of --pattern, or of the first section of a list [default: 0, or that of
     /// the tiles that are listed at first]
     #[arg(long, value_name = "NUMBER")]
     first: Option<u32>,
 
-    /// Names of the channels, in order [default: one without a name]
-    #[arg(
-        long,
-        value_name = "NAME,...",
-        value_delimiter = ',',
-        requires = "pattern"
-    )]
+    /// Names of the channels, in order, with --pattern [default: one without a name, as of a list]
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
     channels: Vec<String>,
 
     /// Bits of a voxel, 8 or 16, with --pattern or a list [default: 8, or as the images have that are listed at first]
@@ -110,13 +111,33 @@ impl Bare {
             }
             Err(nothing @ AcquisitionError::NoInfo { .. }) => {
                 let before = kept.and_then(|kept| kept_list(folder, kept));
+                if self.list.is_none()
+                    && let Some(before) = &before
+                {
+                    // What was a file when it was found may be a link by now.
+                    refuse_link_out(before)?;
+                }
                 let list = match self.list.clone().or_else(|| before.clone()) {
                     Some(list) => Some(list),
                     None => find_list(folder)?,
                 };
                 let Some(list) = list else {
+                    if let Some(option) = self.of_lists() {
+                        bail!(
+                            "{option} is for folders with a list of their images or whose file names say where these lie, \
+                             but no list was found: name it with --list, or say with --pattern how the files are named: {}",
+                            folder.display()
+                        );
+                    }
                     return Err(nothing.into());
                 };
+                ensure!(
+                    self.channels.is_empty(),
+                    "lists know no channels: leave --channels out, and take the images of each channel in as a volume of \
+                     their own (--volume NAME, with a list of their own); or say with --pattern how file names tell the \
+                     channel, or with records (tiles.jsonl) which one each image is of: {}",
+                    list.display()
+                );
                 let config = self.listed(list, name)?;
                 say(&format!(
                     "the places are those of {}",
@@ -142,6 +163,8 @@ impl Bare {
             (self.pixel.is_some(), "--pixel"),
             (self.first.is_some(), "--first"),
             (self.bits.is_some(), "--bits"),
+            (self.drop_after.is_some(), "--drop-after"),
+            (!self.channels.is_empty(), "--channels"),
         ];
         let first = given.into_iter().find(|(given, _)| *given);
         first.map(|(_, option)| option)
@@ -198,6 +221,9 @@ impl Bare {
             scale: self.pixel.unwrap_or(1.0),
             poll: IngestOptions::DEFAULT.poll,
             rest: ListConfig::REST,
+            drop_after: self.drop_after.map_or(ListConfig::DROP_AFTER, |seconds| {
+                Duration::from_secs(seconds.into())
+            }),
             budget: WatchConfig::BUDGET,
         };
         ensure!(

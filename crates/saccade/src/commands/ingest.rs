@@ -7,12 +7,12 @@ use anyhow::Result;
 use clap::Args;
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::catalog::Catalog;
-use saccade_archive::pyramid::Encoding;
+use saccade_archive::pyramid::{Encoding, PyramidIndex};
 use saccade_archive::{ArchiveLocation, CatalogLocation, VisualizationArchive};
-use saccade_core::volume::check_name;
-use saccade_ingest::Cancel;
+use saccade_core::volume::{Dtype, VoxelKind, check_name};
 use saccade_ingest::ingest::{IngestOptions, Summary, run};
 use saccade_ingest::watch::{self, Disk, ListWatch, Until, Watch};
+use saccade_ingest::{Cancel, HeldUp};
 use tokio::task::JoinHandle;
 
 use super::followed::{Bare, Followed};
@@ -74,6 +74,32 @@ impl Stored {
             None => IngestOptions::DEFAULT.encoding,
         }
     }
+}
+
+/// What was taken in stays as it is stored: one that is asked for otherwise would be of both kinds.
+async fn refuse_other_encoding(
+    archive: &VisualizationArchive,
+    volume: &str,
+    stored: &Stored,
+) -> Result<()> {
+    let Ok(Some(pyramid)) = archive.catalog().pyramid_of(volume).await else {
+        return Ok(());
+    };
+    // A damaged one is told by others.
+    let Ok(index) = PyramidIndex::open(archive.storage().as_ref(), &pyramid).await else {
+        return Ok(());
+    };
+    let is = archive.catalog().volume(volume).await?;
+    let jpeg_can = is.dtype == Dtype::Uint8 && is.kind == VoxelKind::Intensity;
+    let (option, stored_as) = match (index.is_lossless(), stored.lossless, stored.quality) {
+        (false, true, _) => ("--lossless", "as JPEG"),
+        (true, _, Some(_)) if jpeg_can => ("--quality", "losslessly"),
+        _ => return Ok(()),
+    };
+    anyhow::bail!(
+        "the tiles of volume {volume:?} that are there are stored {stored_as}, and {option} would not change them: leave \
+         it out, or take all in anew under another name (--volume NAME) or into another archive"
+    )
 }
 
 /// The acquisition archive is only read: nothing is made in or around it.
@@ -171,6 +197,7 @@ impl Ingest {
         followed: Followed,
         kept: &Path,
         cancel: &Cancel,
+        held_up: HeldUp,
     ) -> Result<Option<Begun>> {
         let shared = |leads: bool| {
             if !leads {
@@ -183,7 +210,8 @@ impl Ingest {
         Ok(match followed {
             Followed::Records => None,
             Followed::Pattern(config) => {
-                let mut watch = Watch::open(config, Disk, &self.acquisition, kept)?;
+                let mut watch =
+                    Watch::open(config, Disk, &self.acquisition, kept)?.telling(held_up);
                 shared(watch.leads());
                 let folder = watch.folder().to_owned();
                 let mut watching = None;
@@ -203,7 +231,8 @@ impl Ingest {
                 })
             }
             Followed::List(config) => {
-                let mut watch = ListWatch::open(config, Disk, &self.acquisition, kept)?;
+                let watch = ListWatch::open(config, Disk, &self.acquisition, kept)?;
+                let mut watch = watch.telling(held_up);
                 shared(watch.leads());
                 let until = if once { Until::End } else { Until::Known };
                 let ends = cancel.clone();
@@ -271,12 +300,23 @@ impl Ingest {
                 );
             };
             acquisition.clone_from(&kept);
-            let begun = self.begin(followed, &kept, &cancel).await?;
+            let held_up = HeldUp::default();
+            options.held_up = Some(held_up.clone());
+            let begun = self.begin(followed, &kept, &cancel, held_up).await?;
             let Some(begun) = begun.filter(|_| !cancel.is_cancelled()) else {
                 return Ok(ExitCode::SUCCESS);
             };
             options.linked = Some(begun.folder);
             (watching, missing) = (begun.watching, begun.missing);
+        }
+        let into = options.volume.clone();
+        let into = into.or_else(|| {
+            AcquisitionInfo::read(&acquisition)
+                .ok()
+                .map(|info| info.name)
+        });
+        if let Some(volume) = &into {
+            refuse_other_encoding(&archive, volume, &self.stored).await?;
         }
         let shown = Shown::new("ingest", None);
         let taken_in = run(&acquisition, &archive, &options, &shown, &cancel);

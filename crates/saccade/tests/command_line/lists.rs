@@ -9,7 +9,7 @@ use std::time::Duration;
 use image::{GrayImage, Luma};
 
 use super::errors::{assert_failed, text};
-use super::server_away::says;
+use super::server_away::{Program, says};
 use super::update::ended;
 use super::{Running, done, run, saccade, stderr};
 
@@ -151,6 +151,133 @@ fn options_of_lists_are_for_lists() {
     let listed = run([&ingest[..], &["--list", text(&list), "--origin", "1e12,3"]].concat());
     assert_failed(&listed, 2, &[far]);
     assert!(!archive.join("catalog.sqlite").exists());
+}
+
+#[test]
+fn what_a_list_cannot_say_or_change_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive, empty] =
+        ["scope", "archive", "empty"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    std::fs::create_dir(&empty).unwrap();
+    picture(&scope, "a.png", 10);
+    std::fs::write(scope.join("list.txt"), "\u{feff}a.png 0 0 0\n").unwrap();
+    let ingest = [
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--once",
+        "--voxel",
+        "4",
+    ];
+    let channels = run([&ingest[..], &["--channels", "SE,BSE"]].concat());
+    let ways = [
+        "lists know no channels",
+        "--volume NAME",
+        "--pattern",
+        "tiles.jsonl",
+    ];
+    assert_failed(&channels, 1, &ways);
+    let nothing = ["ingest", text(&empty), text(&archive), "--origin", "3,4"];
+    assert_failed(
+        &run(nothing),
+        1,
+        &["--origin is for folders with a list", "--list", "--pattern"],
+    );
+    assert!(!archive.join("catalog.sqlite").exists());
+
+    // What is there is not both.
+    done(ingest);
+    let lossless = run([&ingest[..], &["--lossless"]].concat());
+    assert_failed(
+        &lossless,
+        1,
+        &[
+            "stored as JPEG",
+            "--lossless would not change them",
+            "--volume NAME",
+        ],
+    );
+    done([&ingest[..], &["--quality", "70"]].concat());
+    let second = [
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--once",
+        "--voxel",
+        "4",
+        "--volume",
+        "second",
+    ];
+    done([&second[..], &["--lossless"]].concat());
+    let quality = run([&second[..], &["--quality", "70"]].concat());
+    assert_failed(
+        &quality,
+        1,
+        &["stored losslessly", "--quality", "--volume NAME"],
+    );
+}
+
+/// Those who look from elsewhere are told what it waits for, as long as it does.
+#[test]
+fn what_a_list_waits_for_is_in_its_status() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir_all(scope.join("one")).unwrap();
+    std::fs::create_dir_all(scope.join("two")).unwrap();
+    for name in ["one/a.png", "two/a.png", "b.png"] {
+        picture(&scope, name, 10);
+    }
+    let list = scope.join("list.txt");
+    std::fs::write(&list, "a.png 0 0 0\nb.png 35 0 0\n").unwrap();
+    let ingest = [
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--voxel",
+        "4",
+        "--extent",
+        "99,99,9",
+    ];
+    let ingest = Program::start_with(&ingest, &[]);
+    let said = says(&ingest.stderr, "in several folders");
+    assert!(
+        said.contains("one/a.png") && said.contains("two/a.png"),
+        "{said}"
+    );
+    while !archive.join("catalog.sqlite").exists() {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let (_serving, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let until = |fits: &dyn Fn(&[serde_json::Value]) -> bool| {
+        for _ in 0..600 {
+            let answer = reqwest::get(format!("{url}v/scope/status.json"));
+            let status =
+                runtime.block_on(async { answer.await?.json::<serde_json::Value>().await });
+            let held_up = status
+                .ok()
+                .and_then(|status| status["held_up"].as_array().cloned());
+            if held_up.as_deref().is_some_and(fits) {
+                return held_up.unwrap();
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        panic!("it does not come about");
+    };
+    let reason = until(&|held_up| !held_up.is_empty()).remove(0);
+    let why = reason["why"].as_str().unwrap();
+    assert!(
+        why.contains("one/a.png") && why.contains("two/a.png"),
+        "{why}"
+    );
+    assert!(
+        !why.contains(text(&scope)),
+        "where it lies is nobody's matter: {why}"
+    );
+    assert!(reason["since"].as_u64().unwrap() > 1_700_000_000);
+    std::fs::write(&list, "two/a.png 0 0 0\nb.png 35 0 0\n").unwrap();
+    until(&|held_up| held_up.is_empty());
 }
 
 /// Followed, until it is told to end; a list that grows is taken in meanwhile.

@@ -4,8 +4,10 @@
 
 mod demo;
 mod errors;
+mod export_power_cuts;
 mod failed_sync;
 mod images;
+mod kills;
 mod labels;
 mod lists;
 #[allow(dead_code, reason = "others use more of it")]
