@@ -66,6 +66,10 @@ pub struct ExportOptions {
     pub rename_labels: bool,
     /// Pause before a chunk that failed for a passing reason is asked for again, if the source names none.
     pub retry: Duration,
+    /// A chunk that fails for passing reasons is asked for up to ten times, and not again once it has been asked for during so
+    /// long. Each request has deadlines of its source's: [`Patience`](crate::objects::Patience),
+    /// [`RemoteOptions`](crate::remote::RemoteOptions).
+    pub patience: Duration,
 }
 
 impl Default for ExportOptions {
@@ -77,6 +81,7 @@ impl Default for ExportOptions {
             compression: 3,
             rename_labels: false,
             retry: Duration::from_secs(1),
+            patience: Duration::from_secs(300),
         }
     }
 }
@@ -235,7 +240,7 @@ pub async fn export(
             .map(|&shard| {
                 let (encoder, plan) = (&encoder, &plan);
                 async move {
-                    let bytes = encoder.shard(source, plan, shard, options.retry).await?;
+                    let bytes = encoder.shard(source, plan, shard, options).await?;
                     // Before it is written: an export that goes on keeps what is there.
                     if let Some(id) = source.renamed_label().filter(|_| !plan.rename_labels) {
                         return Err(ExportError::Label { id });

@@ -27,9 +27,14 @@ pub use error::ObjectError;
 #[cfg(not(target_family = "wasm"))]
 pub use folder::FolderObjects;
 pub use http::HttpObjects;
+#[cfg(not(target_family = "wasm"))]
+pub(crate) use http::chain;
 pub use location::{Location, LocationError};
 pub use memory::MemoryObjects;
+pub(crate) use retry::Pace;
 pub use retry::Patience;
+#[cfg(not(target_family = "wasm"))]
+pub(crate) use retry::is_to_be_told;
 #[cfg(not(target_family = "wasm"))]
 pub use s3::S3Objects;
 

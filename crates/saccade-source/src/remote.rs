@@ -44,6 +44,8 @@ const LARGEST_CHUNK: u64 = 1 << 28;
 pub struct RemoteOptions {
     /// A chunk of which nothing more came for so long has failed.
     pub idle: Duration,
+    /// A chunk must come faster than this, counted from its beginning on, after `idle` has passed \[bytes/s\].
+    pub slowest: u32,
     /// An event stream on which nothing came for so long, not even a comment, is opened anew.
     pub events_idle: Duration,
     /// Wait before the first attempt to open the event stream anew; it doubles with each failure.
@@ -56,6 +58,7 @@ impl Default for RemoteOptions {
     fn default() -> Self {
         Self {
             idle: Duration::from_secs(30),
+            slowest: 4096,
             events_idle: Duration::from_secs(60),
             reconnect: Duration::from_millis(250),
             reconnect_at_most: Duration::from_secs(10),
@@ -101,6 +104,16 @@ pub enum RemoteError {
         /// What was asked for.
         url: Url,
     },
+    /// It came, but so slowly that it would hardly end.
+    #[error("no more than {come} of {expected} bytes came in time from {url}")]
+    Slow {
+        /// Bytes that came.
+        come: usize,
+        /// Bytes of a chunk.
+        expected: usize,
+        /// What was asked for.
+        url: Url,
+    },
     /// A chunk is not as long as the volume's chunks are.
     #[error("{got} bytes or more came instead of {expected} from {url}")]
     Length {
@@ -125,7 +138,7 @@ impl RemoteError {
     /// Whether asking again may help.
     fn is_transient(&self) -> bool {
         match self {
-            Self::Http { .. } | Self::Idle { .. } => true,
+            Self::Http { .. } | Self::Idle { .. } | Self::Slow { .. } => true,
             // A server that has started again offers its volumes one by one.
             Self::Status { status, .. } => {
                 status.is_server_error() || *status == StatusCode::NOT_FOUND

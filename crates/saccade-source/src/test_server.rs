@@ -32,6 +32,8 @@ pub(crate) enum Fault {
     Stall,
     /// A few bytes a second.
     Drip,
+    /// The same, of the status line and headers.
+    SlowHead,
     /// The whole object, whatever part was asked for.
     Whole,
     /// Another part than was asked for.
@@ -221,6 +223,14 @@ impl TestServer {
         }
         match fault {
             None | Some(Fault::Whole | Fault::Status(_)) => {}
+            Some(Fault::SlowHead) => {
+                for byte in format!("HTTP/1.1 {head}\r\n").as_bytes().chunks(1) {
+                    stream.write_all(byte).await?;
+                    stream.flush().await?;
+                    tokio::time::sleep(Duration::from_millis(100)).await;
+                }
+                return Ok(false);
+            }
             Some(Fault::Reset) => {
                 stream.shutdown().await?;
                 return Ok(false);

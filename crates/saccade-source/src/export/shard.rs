@@ -7,12 +7,14 @@ use bytes::Bytes;
 use futures::{StreamExt, stream};
 use glam::UVec3;
 use saccade_core::voxel_box::VoxelBox;
+use tokio::time::Instant;
 use zarrs::array::{Array, ArrayBytes, ArrayMetadata};
 use zarrs::storage::store::MemoryStore;
 use zarrs::storage::{ReadableStorageTraits, WritableStorageTraits};
 
-use super::ExportError;
 use super::plan::{Plan, ShardId};
+use super::{ExportError, ExportOptions};
+use crate::objects::{chain, is_to_be_told};
 use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
 
 /// Chunks that are read at a time for one shard.
@@ -50,9 +52,9 @@ impl ShardEncoder {
         source: &Arc<dyn VolumeSource>,
         plan: &Plan,
         shard: ShardId,
-        retry: Duration,
+        options: &ExportOptions,
     ) -> Result<Option<Bytes>, ExportError> {
-        let Some(voxels) = read(source, plan, shard, retry).await? else {
+        let Some(voxels) = read(source, plan, shard, options).await? else {
             return Ok(None);
         };
         let (array, store) = (self.levels[shard.level].clone(), self.store.clone());
@@ -76,7 +78,7 @@ async fn read(
     source: &Arc<dyn VolumeSource>,
     plan: &Plan,
     shard: ShardId,
-    retry: Duration,
+    options: &ExportOptions,
 ) -> Result<Option<Vec<u8>>, ExportError> {
     let (volume, planned) = (&plan.volume, &plan.levels[shard.level]);
     let wanted = planned.voxels_of(shard.xyz());
@@ -87,7 +89,7 @@ async fn read(
         chunk,
     });
     let mut chunks = stream::iter(ids)
-        .map(|id| async move { Ok::<_, ExportError>((id, patiently(source, id, retry).await?)) })
+        .map(|id| async move { Ok::<_, ExportError>((id, patiently(source, id, options).await?)) })
         .buffer_unordered(CHUNKS_AT_ONCE);
     let bytes = volume.dtype.bytes();
     let mut voxels = None;
@@ -121,19 +123,24 @@ fn offset(at: UVec3, size: UVec3) -> usize {
 async fn patiently(
     source: &Arc<dyn VolumeSource>,
     id: ChunkId,
-    retry: Duration,
+    options: &ExportOptions,
 ) -> Result<Chunk, ExportError> {
-    let mut pause = retry;
+    let begun = Instant::now();
+    let mut pause = options.retry;
     let mut attempt = 1;
     loop {
         let error: ChunkError = match source.read(id).await {
             Ok(chunk) => return Ok(chunk),
             Err(error) => error,
         };
-        if !error.is_transient() || attempt == ATTEMPTS {
+        let is_last = attempt == ATTEMPTS || begun.elapsed() >= options.patience;
+        if !error.is_transient() || is_last {
             return Err(ExportError::Read { source: error });
         }
-        log::info!("{error}; asking again");
+        match is_to_be_told() {
+            true => log::warn!("{}; asking again", chain(&error)),
+            false => log::info!("{error}; asking again"),
+        }
         tokio::time::sleep(error.retry_after().unwrap_or(pause)).await;
         pause = (pause * 2).min(LONGEST_PAUSE);
         attempt += 1;

@@ -1,4 +1,5 @@
 mod resumed;
+mod slow;
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};

@@ -315,7 +315,8 @@ fn shown(url: &Url) -> String {
     url.into()
 }
 
-pub(super) fn chain(error: &dyn std::error::Error) -> String {
+/// An error with all its causes, in one line.
+pub(crate) fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
     while let Some(error) = cause {

@@ -88,24 +88,34 @@ impl Patience {
     }
 }
 
-/// Whether an answer that has begun comes fast enough.
-pub(super) struct Pace {
-    patience: Patience,
+/// Whether an answer that has begun comes fast enough: one that sends a byte now and then is never silent, and never ends.
+pub(crate) struct Pace {
+    idle: Duration,
+    slowest: u32,
     begun: Instant,
 }
 
 impl Pace {
-    pub(super) fn new(patience: Patience) -> Self {
+    /// It may take `idle` to get going, and then has to come by `slowest` bytes/s, counted from there on.
+    pub(crate) fn new(idle: Duration, slowest: u32) -> Self {
         #[expect(clippy::disallowed_methods, reason = "web_time's, which browsers have")]
         let begun = Instant::now();
-        Self { patience, begun }
+        Self {
+            idle,
+            slowest,
+            begun,
+        }
+    }
+
+    /// Whether it is too little that so many bytes have come by now.
+    pub(crate) fn is_too_slow(&self, come: u64) -> bool {
+        let seconds = self.begun.elapsed().saturating_sub(self.idle);
+        (come as f64) < seconds.as_secs_f64() * f64::from(self.slowest)
     }
 
     /// Of which so many bytes have come by now.
     pub(super) fn check(&self, come: u64) -> Result<(), Failure> {
-        let seconds = self.begun.elapsed().saturating_sub(self.patience.idle);
-        let least = seconds.as_secs_f64() * f64::from(self.patience.slowest);
-        match (come as f64) < least {
+        match self.is_too_slow(come) {
             true => Err(Failure::again(format!(
                 "no more than {come} bytes came in time"
             ))),
@@ -115,7 +125,7 @@ impl Pace {
 }
 
 /// Whether it is time to say that a store makes us wait: where one object does, many do.
-fn is_to_be_told() -> bool {
+pub(crate) fn is_to_be_told() -> bool {
     const TELL_AGAIN: Duration = Duration::from_secs(30);
     static TOLD: Mutex<Option<Instant>> = Mutex::new(None);
     let mut told = TOLD.lock().unwrap_or_else(PoisonError::into_inner);

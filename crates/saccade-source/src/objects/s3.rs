@@ -223,7 +223,9 @@ impl S3Objects {
                 location: self.location(key),
             })
         };
-        let (answer, told) = told::listen(store.get_opts(&path, options)).await;
+        // Where it is refused, until the words of the refusal are there.
+        let asked = told::listen(store.get_opts(&path, options));
+        let (answer, told) = self.patience.idle(asked).await?;
         let answer = match answer {
             Ok(answer) => answer,
             Err(Error::NotFound { source, .. }) => {
@@ -286,7 +288,8 @@ impl S3Objects {
     /// As many bytes as were announced, and no more than these.
     async fn body(&self, answer: GetResult) -> Result<Bytes, Failure> {
         let expected = answer.range.end.saturating_sub(answer.range.start);
-        let (mut body, pace) = (answer.into_stream(), Pace::new(self.patience));
+        let pace = Pace::new(self.patience.idle, self.patience.slowest);
+        let mut body = answer.into_stream();
         let mut bytes = Vec::new();
         while let Some(more) = self.patience.idle(body.next()).await? {
             let more = more.map_err(|error| Failure::again(super::http::chain(&error)))?;

@@ -10,6 +10,7 @@ use reqwest::{StatusCode, Url, header};
 use saccade_core::voxel_box::VoxelBox;
 
 use super::{NOTHING_ACQUIRED, RENAMED_LABEL, RemoteError, RemoteSource, joined, refusal, within};
+use crate::objects::Pace;
 use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId};
 
 /// When to ask again, where the server does not say.
@@ -124,11 +125,20 @@ impl RemoteSource {
         let expected = self.chunk_bytes;
         let mut bytes = BytesMut::with_capacity(expected);
         let mut body = answer.bytes_stream();
+        let pace = Pace::new(idle, self.options.slowest);
         while let Some(more) = within(idle, &url, body.next()).await? {
             bytes.extend_from_slice(&more.map_err(http)?);
             // Never more than a chunk and a piece, whatever is sent.
             if bytes.len() > expected {
                 break;
+            }
+            if pace.is_too_slow(bytes.len() as u64) {
+                let (come, url) = (bytes.len(), url.clone());
+                return Err(RemoteError::Slow {
+                    come,
+                    expected,
+                    url,
+                });
             }
         }
         if bytes.len() == expected {

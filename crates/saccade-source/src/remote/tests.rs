@@ -192,6 +192,36 @@ fn failures_are_told_apart_and_pass() {
     });
 }
 
+/// What is never silent for long, and would take minutes.
+#[test]
+fn a_chunk_that_trickles_in_is_given_up() {
+    run(async {
+        let server = Server::start(array()).await;
+        let options = RemoteOptions {
+            idle: Duration::from_millis(200),
+            slowest: 10_000,
+            ..options()
+        };
+        let remote = RemoteSource::open_with(&server.base, "v 1", options).await;
+        let remote = remote.unwrap();
+        server.faults.lock().unwrap().push_back(Fault::Trickle);
+        let failed = tokio::time::timeout(Duration::from_secs(10), remote.read(FIRST)).await;
+        let error = failed.expect("it ends").unwrap_err();
+        assert!(error.is_transient(), "{error}");
+        let ChunkError::Failed { id, source, .. } = &error else {
+            panic!("{error:?}")
+        };
+        assert_eq!(*id, FIRST);
+        let named = source.to_string();
+        assert!(
+            named.contains("of 1024 bytes came in time") && named.contains("zarr/0/c/0/0/0/0"),
+            "{named}"
+        );
+        let whole = Chunk::Voxels(truth(&server.source, FIRST).into());
+        assert_eq!(remote.read(FIRST).await.unwrap(), whole);
+    });
+}
+
 #[test]
 fn waits_as_long_as_it_is_told() {
     run(async {

@@ -105,7 +105,7 @@ pub(super) async fn read(
     }
     let mut kept = Kept::new(part, partial);
     let mut body = answer.bytes_stream();
-    let pace = Pace::new(patience);
+    let pace = Pace::new(patience.idle, patience.slowest);
     while let Some(more) = patience.idle(body.next()).await? {
         let more = more.map_err(|error| Failure::again(chain(&error.without_url())))?;
         kept.add(&more);

@@ -97,6 +97,7 @@ async fn what_passes_is_waited_for() {
         Fault::Cut,
         Fault::Stall,
         Fault::Drip,
+        Fault::SlowHead,
         Fault::Longer(-2),
         Fault::Longer(3),
         Fault::WrongLength,
@@ -180,6 +181,9 @@ async fn s3_waits_for_what_passes() {
         Fault::Status("500 Oops"),
         Fault::Reset,
         Fault::Cut,
+        Fault::Stall,
+        Fault::Drip,
+        Fault::SlowHead,
     ] {
         // A number in an address is no answer.
         for key in ["a/b/ten", "c/416/ten"] {

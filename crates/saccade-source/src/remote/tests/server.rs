@@ -34,6 +34,8 @@ pub(super) enum Fault {
     Stall,
     /// The right body in small pieces.
     Drip,
+    /// The right body, a byte now and then.
+    Trickle,
 }
 
 pub(super) struct Server {
@@ -258,6 +260,15 @@ impl Server {
                 // Returns when the client hangs up.
                 let _ = stream.read(&mut byte).await;
                 self.gone.fetch_add(1, Ordering::SeqCst);
+                Ok(())
+            }
+            Some(Fault::Trickle) => {
+                stream.write_all(head.as_bytes()).await?;
+                for byte in bytes.chunks(1) {
+                    stream.write_all(byte).await?;
+                    stream.flush().await?;
+                    tokio::time::sleep(Duration::from_millis(20)).await;
+                }
                 Ok(())
             }
             Some(Fault::Drip) => {
