@@ -15,6 +15,7 @@ mod retry;
 #[cfg(not(target_family = "wasm"))]
 mod s3;
 mod same;
+mod transport;
 
 use std::fmt;
 use std::ops::Range;

@@ -57,6 +57,8 @@ pub(crate) struct TestServer {
     pub(crate) missing: Mutex<&'static str>,
     /// Tag of every object, if they have any.
     pub(crate) tag: Mutex<Option<&'static str>>,
+    /// Further headers of every object, each behind a line's end.
+    pub(crate) headers: Mutex<&'static str>,
     /// Every answer waits so long.
     pub(crate) latency: Mutex<Duration>,
     /// Requests that are being answered, and the most there ever were.
@@ -77,6 +79,7 @@ impl TestServer {
             log: Mutex::default(),
             missing: Mutex::new("404 Not Found"),
             tag: Mutex::default(),
+            headers: Mutex::default(),
             latency: Mutex::default(),
             busy: AtomicUsize::new(0),
             busiest: AtomicUsize::new(0),
@@ -221,6 +224,7 @@ impl TestServer {
         if let Some(tag) = *self.tag.lock().unwrap() {
             head += &format!("\r\netag: {tag}");
         }
+        head += *self.headers.lock().unwrap();
         match fault {
             None | Some(Fault::Whole | Fault::Status(_)) => {}
             Some(Fault::SlowHead) => {

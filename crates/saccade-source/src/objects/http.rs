@@ -210,7 +210,7 @@ impl HttpObjects {
     async fn attempt(&self, key: &str, url: &Url, part: &Part) -> Result<Found, Failure> {
         // The semaphore is never closed.
         let _permit = self.requests.acquire().await.ok();
-        let mut request = self.client.get(url.clone());
+        let mut request = platform::unencoded(self.client.get(url.clone()));
         match part {
             Part::Whole { .. } => {}
             Part::Range(range) => {

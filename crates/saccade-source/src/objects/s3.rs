@@ -9,7 +9,7 @@ use futures::StreamExt as _;
 use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey, resolve_bucket_region};
 use object_store::path::Path;
 use object_store::{
-    ClientOptions, Error, GetOptions, GetRange, GetResult, ObjectStore, RetryConfig,
+    Attribute, ClientOptions, Error, GetOptions, GetRange, GetResult, ObjectStore, RetryConfig,
 };
 use saccade_archive::storage::BucketLocation;
 use tokio::sync::{OnceCell, Semaphore};
@@ -18,6 +18,7 @@ use super::error::Failure;
 use super::refusals::{EXPIRED, Found, Refusal, Refusals};
 use super::retry::Pace;
 use super::same::{Marks, strong};
+use super::transport::{begins_a_page, names_a_page, page, plain};
 use super::{LocationError, ObjectError, Objects, Part, Patience, is_key};
 use crate::maybe_send::BoxFuture;
 
@@ -282,7 +283,16 @@ impl S3Objects {
         let mark = (mark != (None, None)).then_some(mark);
         let same = self.tags.check(key, part, mark, || self.location(key));
         same.map_err(Failure::Final)?;
-        self.body(answer).await.map(Found::Object)
+        let text = |name| answer.attributes.get(&name).map(|value| value.to_string());
+        let names_a_page = text(Attribute::ContentType).is_some_and(|media| names_a_page(&media));
+        let encoding = text(Attribute::ContentEncoding);
+        let is_beginning = answer.range.start == 0;
+        let bytes = self.body(answer).await?;
+        let location = self.location(key);
+        if names_a_page && is_beginning && begins_a_page(&bytes) {
+            return Err(page(&location));
+        }
+        plain(bytes, encoding.as_deref(), part, &location).map(Found::Object)
     }
 
     /// As many bytes as were announced, and no more than these.

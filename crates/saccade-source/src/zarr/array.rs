@@ -305,6 +305,14 @@ fn sharded(
     }
     let codecs = configuration["codecs"].as_array();
     let codecs = codecs.ok_or_else(|| wrong("its shards' chunks have no codecs"))?;
+    if codecs
+        .iter()
+        .any(|codec| codec["name"] == "sharding_indexed")
+    {
+        let nested = "the chunks of its shards are shards themselves, which is not read; shards whose chunks are plain are: write it \
+                      anew with one level of shards";
+        return Err(Refusal::Unsupported(nested.to_owned()));
+    }
     let encoding = encoding_of(codecs, shard.len(), number)?;
     let index = configuration["index_codecs"].as_array();
     let index = index.ok_or_else(|| wrong("its shards' indices have no codecs"))?;
@@ -421,6 +429,11 @@ fn codec_named(name: &str) -> Result<Codec, Refusal> {
 }
 
 fn unknown_codec(name: &str) -> Refusal {
+    if name == "sharding_indexed" {
+        let around = "its sharding is combined with other codecs around it, which is not read; write it anew with sharding as \
+                      its only codec";
+        return Refusal::Unsupported(around.to_owned());
+    }
     Refusal::Unsupported(format!(
         "it is encoded by {name:?}; blosc, zstd, gzip, zlib, lz4 and crc32c are known, and shards whose chunks are"
     ))

@@ -9,6 +9,7 @@ use reqwest::{Response, StatusCode, header};
 use super::chain;
 use crate::objects::error::Failure;
 use crate::objects::retry::Pace;
+use crate::objects::transport::{BEGINNING, begins_a_page, names_a_page, page, plain};
 use crate::objects::{ObjectError, Part, Patience};
 
 /// Longest object that is read in whole because its server ignores ranges \[bytes\]. Of one, no more is kept than was asked for.
@@ -22,6 +23,32 @@ pub(super) async fn read(
     part: &Part,
     patience: Patience,
     location: &str,
+) -> Result<Bytes, Failure> {
+    let text = |name| answer.headers().get(name)?.to_str().ok().map(str::to_owned);
+    let names_a_page = text(header::CONTENT_TYPE).is_some_and(|media| names_a_page(&media));
+    // Browsers have decoded it.
+    let encoding = text(header::CONTENT_ENCODING).filter(|_| !cfg!(target_family = "wasm"));
+    let mut beginning = Vec::new();
+    let bytes = read_part(answer, part, patience, location, &mut beginning).await;
+    match &bytes {
+        Err(Failure::Again { .. }) => return bytes,
+        // Where it was not even begun, its size alone was wrong.
+        Err(Failure::Final(_)) if names_a_page && beginning.is_empty() => {
+            return Err(page(location));
+        }
+        _ if names_a_page && begins_a_page(&beginning) => return Err(page(location)),
+        _ => {}
+    }
+    plain(bytes?, encoding.as_deref(), part, location)
+}
+
+/// The same, whatever it is that came, and how that began, where it is known.
+async fn read_part(
+    answer: Response,
+    part: &Part,
+    patience: Patience,
+    location: &str,
+    beginning: &mut Vec<u8>,
 ) -> Result<Bytes, Failure> {
     let partial = answer.status() == StatusCode::PARTIAL_CONTENT;
     let range = content_range(&answer);
@@ -108,6 +135,9 @@ pub(super) async fn read(
     let pace = Pace::new(patience.idle, patience.slowest);
     while let Some(more) = patience.idle(body.next()).await? {
         let more = more.map_err(|error| Failure::again(chain(&error.without_url())))?;
+        if !partial && beginning.len() < BEGINNING {
+            beginning.extend_from_slice(&more[..more.len().min(BEGINNING)]);
+        }
         kept.add(&more);
         if cut_by_us && kept.come >= most {
             break;

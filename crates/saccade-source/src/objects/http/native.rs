@@ -1,5 +1,5 @@
-use reqwest::Client;
 use reqwest::redirect::{Attempt, Policy};
+use reqwest::{Client, RequestBuilder, header};
 
 use super::chain;
 use crate::objects::error::Failure;
@@ -25,6 +25,11 @@ pub(super) fn client() -> Client {
     };
     let client = Client::builder().redirect(Policy::custom(own));
     client.build().unwrap_or_default()
+}
+
+/// Asks for the bytes as they are.
+pub(super) fn unencoded(request: RequestBuilder) -> RequestBuilder {
+    request.header(header::ACCEPT_ENCODING, "identity")
 }
 
 /// What it means that no answer came.

@@ -3,6 +3,7 @@
 
 mod refused;
 mod replaced;
+mod transport;
 
 use std::time::Duration;
 

@@ -1,5 +1,5 @@
 use js_sys::{Function, Object, Promise, Reflect};
-use reqwest::Client;
+use reqwest::{Client, RequestBuilder};
 use wasm_bindgen::{JsCast as _, JsValue};
 use wasm_bindgen_futures::JsFuture;
 
@@ -13,6 +13,11 @@ pub(super) const SUFFIXES: bool = false;
 /// The browser's own, with its own rules.
 pub(super) fn client() -> Client {
     Client::new()
+}
+
+/// Browsers decode what they ask for compressed.
+pub(super) fn unencoded(request: RequestBuilder) -> RequestBuilder {
+    request
 }
 
 /// What it means that no answer came. A browser tells pages nothing; by what it does tell, three cases differ.

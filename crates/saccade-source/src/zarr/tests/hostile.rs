@@ -456,3 +456,69 @@ fn metadata_that_cannot_be_read_say_where() {
         }
     });
 }
+
+/// A server that asks to log in, with 200, wherever one asks: of metadata, and later of voxels.
+#[tokio::test]
+async fn a_page_instead_of_an_image_is_called_one() {
+    let (server, _) = server([4, 33, 40], &blosc()).await;
+    let page = Bytes::from_static(b"<html><body>Log in</body></html>");
+    for way in 0..2 {
+        let source = open_of(server.stores(patience())[way].clone()).await;
+        let objects = server.objects.lock().unwrap().clone();
+        for object in server.objects.lock().unwrap().values_mut() {
+            *object = page.clone();
+        }
+        *server.headers.lock().unwrap() = "\r\ncontent-type: text/html";
+        let error = source.read(id(0)).await.unwrap_err();
+        let named = told(&error);
+        assert!(
+            named.contains("a web page (HTML)") && named.contains("of level 0"),
+            "{named}"
+        );
+        let closed = server.stores(patience())[way].clone();
+        let error = ZarrSource::open(closed, "x").await.unwrap_err();
+        let named = error.source().unwrap().to_string();
+        assert!(
+            named.contains("a web page (HTML)") && named.contains("zarr.json"),
+            "{named}"
+        );
+        *server.objects.lock().unwrap() = objects;
+        *server.headers.lock().unwrap() = "";
+    }
+}
+
+#[tokio::test]
+async fn sharding_that_is_not_read_is_named() {
+    let plain = sharded();
+    let refused = async |codecs: &Value| {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("image.zarr");
+        write(
+            &folder,
+            "uint16",
+            &version_3("uint16", [16, 64, 80], &plain),
+        );
+        for level in fs::read_dir(&folder).unwrap() {
+            let file = level.unwrap().path().join("zarr.json");
+            let Ok(text) = fs::read(&file) else { continue };
+            let mut array: Value = serde_json::from_slice(&text).unwrap();
+            array["codecs"] = codecs.clone();
+            fs::write(file, array.to_string()).unwrap();
+        }
+        let open = ZarrSource::open(Arc::new(FolderObjects::new(&folder)), "x");
+        open.await.unwrap_err().to_string()
+    };
+    let mut nested = plain.clone();
+    nested[0]["configuration"]["codecs"] = plain.clone();
+    let named = refused(&nested).await;
+    assert!(
+        named.contains("are shards themselves") && named.contains("one level of shards"),
+        "{named}"
+    );
+    let around = json!([plain[0], {"name": "gzip", "configuration": {"level": 1}}]);
+    let named = refused(&around).await;
+    assert!(
+        named.contains("sharding is combined with other codecs"),
+        "{named}"
+    );
+}
