@@ -26,6 +26,16 @@ pub(crate) struct VolumeEntry {
     pub(crate) revision: u64,
 }
 
+/// What has changed since a revision.
+#[derive(Debug, Serialize, ToSchema)]
+pub(crate) struct ChangeList {
+    /// A revision of the volume up to which all changes are listed.
+    pub(crate) revision: u64,
+    /// In order of their revisions, each later than the one that was asked for; several may be one whose box holds theirs. Null
+    /// where nobody knows any more what has changed: then anything may have.
+    pub(crate) changes: Option<Vec<ChangeDocument>>,
+}
+
 /// Bounds of chunks' values.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct RangeList {
@@ -187,6 +197,7 @@ impl From<Change> for ChangeDocument {
         crate::routes::volume,
         crate::routes::status,
         crate::routes::changes,
+        crate::routes::changes_after,
         crate::routes::picture,
         crate::routes::ranges,
     ),

@@ -8,11 +8,13 @@ use std::time::Duration;
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
+use futures::future::select;
 use futures::{Stream, StreamExt, stream};
 use saccade_source::Change;
-use tokio::sync::{OwnedSemaphorePermit, watch};
+use tokio::sync::watch;
 
 use crate::api::ChangeDocument;
+use crate::server::StreamPlace;
 use crate::volumes::Published;
 
 /// So that proxies keep a quiet stream, and clients notice a dead one.
@@ -23,7 +25,7 @@ pub(crate) fn events(
     published: Arc<Published>,
     headers: &HeaderMap,
     mut closing: watch::Receiver<bool>,
-    place: OwnedSemaphorePermit,
+    place: StreamPlace,
 ) -> Response {
     let seen = headers.get("last-event-id").map(|id| {
         // An id that is not ours cannot be caught up from: 0 is before every revision we keep.
@@ -32,6 +34,7 @@ pub(crate) fn events(
             .and_then(|id| id.trim().parse().ok())
             .unwrap_or(0)
     });
+    let evicted = place.evicted();
     let events = changes(published, seen).map(move |change| {
         // Given back when the stream ends.
         let _ = &place;
@@ -49,7 +52,9 @@ pub(crate) fn events(
         // An error means that the server is gone: closed just the same.
         drop(closing.wait_for(|closing| *closing).await);
     };
-    let stream = Sse::new(events.take_until(closed));
+    // Whoever is cut off comes back with the revision it has seen.
+    let ended = select(Box::pin(closed), Box::pin(evicted));
+    let stream = Sse::new(events.take_until(ended));
     let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
     (
         unbuffered,

@@ -14,6 +14,7 @@
 //! | `/v/NAME/volume.json` | the description, the revision and the version |
 //! | `/v/NAME/status.json` | tiles, sections, files set aside |
 //! | `/v/NAME/events` | server-sent events, one per change |
+//! | `/v/NAME/changes/REVISION` | what has changed after that revision, as long as it is known |
 //! | `/v/NAME/thumbnail.png` | one section of a coarse level |
 //! | `/v/NAME/zarr/…` | OME-Zarr 0.5 |
 //! | `/v/NAME/zarr2/…` | OME-Zarr 0.4 |

@@ -17,22 +17,24 @@ use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use saccade_core::volume::Dtype;
-use saccade_source::ChunkId;
 use saccade_source::remote::{NOTHING_ACQUIRED, RENAMED_LABEL};
+use saccade_source::{Change, ChunkId};
 use tokio::sync::{Semaphore, watch};
 use tower_http::CompressionLevel;
 use tower_http::compression::CompressionLayer;
 use tower_http::cors::{AllowOrigin, Any, CorsLayer};
 use utoipa::OpenApi;
 
-use crate::api::{Document, RangeList, VolumeDescription, VolumeEntry, VolumeList};
+use crate::api::{
+    ChangeList, Document, FailingVolume, RangeList, VolumeDescription, VolumeEntry, VolumeList,
+};
 use crate::assets::asset;
 use crate::events;
 use crate::formats::{Entry, Format, Unknown};
 use crate::http::{Refusal, cause, failing, mark_encoding, not_found, refusal, try_again};
 use crate::index::index;
 use crate::pieces::piece;
-use crate::server::{Compress, Compressible, Gate, Options, Origins};
+use crate::server::{Compress, Compressible, Gate, Options, Origins, Streams};
 use crate::status::Status;
 use crate::thumbnail::thumbnail;
 use crate::volumes::{Published, Volumes};
@@ -47,7 +49,7 @@ pub(crate) struct Shared {
     closing: watch::Receiver<bool>,
     gate: Gate,
     requests: Semaphore,
-    streams: Arc<Semaphore>,
+    streams: Arc<Streams>,
 }
 
 impl App {
@@ -57,7 +59,7 @@ impl App {
             closing,
             gate: Gate::new(&options.access),
             requests: Semaphore::new(options.limits.requests),
-            streams: Arc::new(Semaphore::new(options.limits.streams)),
+            streams: Streams::new(options.limits.streams),
             options,
         }))
     }
@@ -130,6 +132,7 @@ pub(crate) fn router(app: App) -> Router {
         .route("/v/{name}/volume.json", get(volume))
         .route("/v/{name}/status.json", get(status))
         .route("/v/{name}/events", get(changes))
+        .route("/v/{name}/changes/{revision}", get(changes_after))
         .route("/v/{name}/thumbnail.png", get(picture))
         .route("/v/{name}/ranges/{channel}/{level}/{chunks}", get(ranges))
         .fallback(get(other))
@@ -294,16 +297,71 @@ pub(crate) async fn status(State(app): State<App>, Path(name): Path<String>) -> 
 pub(crate) async fn changes(
     State(app): State<App>,
     Path(name): Path<String>,
+    ConnectInfo(peer): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
 ) -> Response {
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,
     };
-    match app.streams.clone().try_acquire_owned() {
-        Ok(place) => events::events(published, &headers, app.closing.clone(), place),
-        Err(_) => too_much("too many clients listen"),
+    match app.streams.admit(peer.ip()) {
+        Some(place) => events::events(published, &headers, app.closing.clone(), place),
+        None => too_much("too many clients listen"),
     }
+}
+
+/// Changes that are listed at most: more are told as fewer, larger ones.
+const MOST_CHANGES: usize = 16_384;
+
+/// What has changed after a revision, for clients that come back after longer than a stream of changes could be resumed.
+#[utoipa::path(
+    get,
+    path = "/v/{name}/changes/{revision}",
+    params(
+        ("name" = String, Path, description = "name of the volume"),
+        ("revision" = u64, Path, description = "a revision that the volume had")
+    ),
+    responses(
+        (status = 200, body = ChangeList),
+        (status = 404, body = Refusal, description = "no such volume"),
+        (status = 503, body = Refusal, description = "not known in time; ask again after Retry-After")
+    )
+)]
+pub(crate) async fn changes_after(
+    State(app): State<App>,
+    Path((name, revision)): Path<(String, u64)>,
+) -> Response {
+    let published = match find(&app, &name) {
+        Ok(published) => published,
+        Err(refusal) => return *refusal,
+    };
+    // Before it is asked, so that nothing up to it is missing.
+    let now = published.history().revision();
+    let asked = published.source.changes_after(revision);
+    match tokio::time::timeout(app.options.patience, asked).await {
+        Ok(changes) => {
+            let listed = |changes| grouped(changes, MOST_CHANGES);
+            let changes = changes.map(|all| listed(all).into_iter().map(Into::into).collect());
+            described(ChangeList {
+                revision: now,
+                changes,
+            })
+        }
+        Err(_) => too_much("what has changed takes long to look up"),
+    }
+}
+
+/// The same changes, or no more than `most` whose boxes hold theirs.
+fn grouped(changes: Vec<Change>, most: usize) -> Vec<Change> {
+    // Those that follow each other mostly lie beside each other.
+    let join = |group: &[Change]| {
+        group.iter().copied().reduce(|all, next| Change {
+            voxels: all.voxels.union(next.voxels),
+            ..next
+        })
+    };
+    let size = changes.len().div_ceil(most).max(1);
+    changes.chunks(size).filter_map(join).collect()
 }
 
 /// The description of all this.
@@ -467,4 +525,40 @@ fn find(app: &App, name: &str) -> Result<Arc<Published>, Box<Response>> {
         let error = format!("there is no volume {name:?}");
         Box::new(not_found(error, app.volumes.names()))
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::UVec3;
+    use saccade_core::voxel_box::VoxelBox;
+    use saccade_source::ChangeReason;
+
+    #[test]
+    fn many_changes_are_told_as_fewer_that_hold_them() {
+        let change = |n: u32| {
+            let min = UVec3::new(n * 10, n % 7, 0);
+            Change {
+                revision: u64::from(n) + 5,
+                voxels: VoxelBox::new(min, min + 4),
+                reason: ChangeReason::Tile,
+            }
+        };
+        for (count, most) in [(0, 3), (3, 3), (4, 3), (10, 3), (100, 7)] {
+            let all: Vec<Change> = (0..count).map(change).collect();
+            let few = grouped(all.clone(), most);
+            assert!(few.len() <= most && few.is_empty() == all.is_empty());
+            assert!(few.is_sorted_by_key(|change| change.revision));
+            assert_eq!(
+                few.last().map(|change| change.revision),
+                all.last().map(|change| change.revision)
+            );
+            for change in all {
+                let held = |few: &Change| few.voxels.intersection(change.voxels) == change.voxels;
+                assert!(few.iter().any(held), "{change:?}");
+            }
+        }
+        let all: Vec<Change> = (0..3).map(change).collect();
+        assert_eq!(grouped(all.clone(), 3), all);
+    }
 }

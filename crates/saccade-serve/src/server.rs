@@ -7,6 +7,7 @@ mod connections;
 mod heads;
 mod limits;
 mod paced;
+mod streams;
 
 use std::future::Future;
 use std::io;
@@ -19,6 +20,7 @@ use tokio::sync::watch;
 pub(crate) use access::Gate;
 pub use access::{Access, Origins};
 pub use limits::Limits;
+pub(crate) use streams::{StreamPlace, Streams};
 
 use crate::routes::{App, router};
 use crate::volumes::Volumes;

@@ -6,7 +6,7 @@
 mod changes;
 mod reading;
 
-pub use changes::{check_changes, check_missed};
+pub use changes::{check_changes, check_changes_after, check_missed};
 pub use reading::{check_reading, check_volume};
 
 use std::fmt;

@@ -5,6 +5,7 @@ mod client;
 mod event_parser;
 mod events;
 mod ranges;
+mod since;
 mod status;
 
 use std::sync::Arc;
@@ -312,6 +313,11 @@ impl VolumeSource for RemoteSource {
 
     fn changes(&self) -> BoxStream<'static, Change> {
         self.changes.stream()
+    }
+
+    /// Asks the server; `None` where it does not know, or does not answer in a few attempts.
+    fn changes_after(&self, revision: u64) -> BoxFuture<'_, Option<Vec<Change>>> {
+        Box::pin(self.since(revision))
     }
 
     fn renamed_label(&self) -> Option<u64> {

@@ -11,7 +11,8 @@ pub struct Limits {
     pub connections: usize,
     /// Requests being answered at once. Others are told to ask again.
     pub requests: usize,
-    /// Streams of changes at once. Others are told to ask again.
+    /// Streams of changes at once. When one more comes, the client with the most gives one up, if it has at least two more than
+    /// who comes; otherwise who comes is told to ask again. A client is an address, and in version 6 a network (/64).
     pub streams: usize,
     /// Longest time until the whole head of a request is there, counted from the connection's start
     /// or from the answer before.

@@ -92,6 +92,7 @@ fn answers_are_what_the_document_says() {
         assert_eq!(
             described,
             [
+                "/v/{name}/changes/{revision}",
                 "/v/{name}/events",
                 "/v/{name}/ranges/{channel}/{level}/{chunks}",
                 "/v/{name}/status.json",
@@ -103,6 +104,7 @@ fn answers_are_what_the_document_says() {
         let filled = |path: &str, name: &str| {
             let path = path.replace("{name}", name);
             let path = path.replace("{channel}/{level}/{chunks}", "0/1/0,0,0;0,0,0");
+            let path = path.replace("{revision}", "0");
             path.trim_start_matches('/').to_owned()
         };
         let picture = &document["paths"]["/v/{name}/thumbnail.png"]["get"]["responses"];

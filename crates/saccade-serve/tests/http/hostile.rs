@@ -381,6 +381,51 @@ fn streams_of_changes_are_counted() {
     });
 }
 
+/// Whoever takes all that there are makes room for others, and not for itself.
+#[cfg(target_os = "linux")]
+#[test]
+fn one_address_cannot_take_all_streams() {
+    use glam::UVec3;
+    use saccade_core::voxel_box::VoxelBox;
+
+    run(async {
+        let served = serve(limited(Limits {
+            streams: 4,
+            ..Limits::DEFAULT
+        }))
+        .await;
+        let from = |address: [u8; 4]| {
+            let client = reqwest::Client::builder().local_address(std::net::IpAddr::from(address));
+            let (client, url) = (
+                client.build().unwrap(),
+                format!("{}v/em/events", served.url),
+            );
+            async move || client.get(&url).send().await.unwrap()
+        };
+        let (greedy, good) = (from([127, 0, 0, 1]), from([127, 0, 0, 2]));
+        let mut held = Vec::new();
+        for _ in 0..4 {
+            held.push(greedy().await);
+        }
+        assert!(held.iter().all(|answer| answer.status() == StatusCode::OK));
+        let more = greedy().await;
+        assert_eq!(more.status(), StatusCode::SERVICE_UNAVAILABLE);
+        assert_eq!(header(more.headers(), "retry-after"), Some("1"));
+        let there = good().await;
+        assert_eq!(there.status(), StatusCode::OK);
+        // The newest of the others ends, as a stream does whose client may come back; the rest go on.
+        let last = held.pop().unwrap().bytes().await;
+        last.expect("it ends, and does not break");
+        assert_eq!(greedy().await.status(), StatusCode::SERVICE_UNAVAILABLE);
+        let voxels = VoxelBox::of_size(UVec3::ONE);
+        served.source.set(voxels, &[9]).unwrap();
+        for mut answer in held.into_iter().chain([there]) {
+            let news = answer.chunk().await.unwrap().expect("it goes on");
+            assert!(news.starts_with(b"event: change"), "{news:?}");
+        }
+    });
+}
+
 #[test]
 fn strangers_names_and_pages_are_refused() {
     run(async {

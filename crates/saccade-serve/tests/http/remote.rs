@@ -4,11 +4,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use futures::FutureExt;
-use glam::UVec3;
+use glam::{DVec3, UVec3};
+use saccade_archive::storage::{FaultyStorage, MemoryStorage, Storage, WriteFault};
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_serve::Options;
-use saccade_source::conformance::{check_changes, check_reading};
+use saccade_source::conformance::{check_changes, check_changes_after, check_reading};
+use saccade_source::export::{ExportOptions, export};
 use saccade_source::maybe_send::{BoxFuture, BoxStream};
 use saccade_source::memory::ArraySource;
 use saccade_source::remote::{RENAMED_LABEL, RemoteSource};
@@ -61,6 +63,88 @@ fn a_remote_source_follows() {
         check_changes(&remote, 4, change, |id| truth(&served, id), 0)
             .await
             .unwrap();
+    });
+}
+
+/// What a source knows of its past goes through a server, and what it does not know is not made up.
+#[test]
+fn a_remote_source_tells_what_has_changed() {
+    run(async {
+        let served = serve(Options::DEFAULT).await;
+        let remote = RemoteSource::open(&served.url, "em").await.unwrap();
+        let mut x = 0;
+        let change = async || {
+            x += 9;
+            let voxels = VoxelBox::new(UVec3::new(x, 3, 2), UVec3::new(x + 5, 40, 19));
+            let values: Vec<u8> = voxels.iter().map(|_| 77).collect();
+            served.source.set(voxels, &values).unwrap();
+            voxels
+        };
+        check_changes_after(&remote, change).await.unwrap();
+        // One that comes back later, with a revision that it once saw.
+        drop(remote);
+        let remote = RemoteSource::open(&served.url, "em").await.unwrap();
+        let told = remote.changes_after(2).await.unwrap();
+        let revisions: Vec<u64> = told.iter().map(|change| change.revision).collect();
+        assert_eq!(revisions, [3, 4]);
+
+        let forgetful = Arc::new(Wide {
+            labels: ArraySource::new(volume(), level0()).unwrap(),
+            notes: Vec::new(),
+            there: UVec3::ZERO,
+            met: AtomicBool::new(false),
+        });
+        let (url, _stop, _) = serve_source(forgetful, Options::DEFAULT).await;
+        let remote = RemoteSource::open(&url, "em").await.unwrap();
+        assert_eq!(remote.changes_after(0).await, None);
+    });
+}
+
+/// One that was interrupted, of a volume that grew meanwhile, keeps what has not changed.
+#[test]
+fn an_export_through_a_server_goes_on() {
+    run(async {
+        let extent = UVec3::new(300, 140, 20);
+        let mut grown = Volume::new("em", extent, DVec3::splat(8.0)).unwrap();
+        grown.chunk = UVec3::splat(16);
+        let voxels = vec![7; extent.element_product() as usize];
+        let source = Arc::new(ArraySource::new(grown, voxels).unwrap());
+        let (url, _stop, _) = serve_source(source.clone(), Options::DEFAULT).await;
+        let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
+        let exported = async || {
+            let remote: Arc<dyn VolumeSource> =
+                Arc::new(RemoteSource::open(&url, "em").await.unwrap());
+            export(&remote, &storage, &ExportOptions::default(), &|_| {}).await
+        };
+        storage.fail_write(9, WriteFault::CrashBefore);
+        exported().await.unwrap_err();
+        storage.restart();
+        let before = storage.list("").await.unwrap();
+        let there = before.iter().filter(|name| name.contains("/c/")).count() as u64;
+        let corner = VoxelBox::new(UVec3::new(290, 3, 3), UVec3::new(291, 4, 4));
+        source.set(corner, &[200]).unwrap();
+        let client = reqwest::Client::new();
+        while {
+            client
+                .get(format!("{url}v/em/volume.json"))
+                .send()
+                .await
+                .unwrap()
+        }
+        .json::<serde_json::Value>()
+        .await
+        .unwrap()["revision"]
+            != 1
+        {
+            tokio::time::sleep(std::time::Duration::from_millis(2)).await;
+        }
+        let done = exported().await.unwrap();
+        assert!(
+            done.kept > 3 && done.kept <= there,
+            "{done:?}, {there} were there"
+        );
+        assert_eq!(done.done, done.shards);
+        assert!(exported().await.unwrap().was_whole);
     });
 }
 

@@ -76,6 +76,63 @@ pub async fn check_missed(
     Ok(())
 }
 
+/// Whoever comes back with a revision that the volume had learns of all that has changed since, and of nothing before; of a
+/// revision that it never had nothing is known.
+///
+/// `change` changes something and returns the box of level-0 voxels it touched. For sources that remember these changes.
+///
+/// # Errors
+///
+/// The first [`Violation`].
+pub async fn check_changes_after(
+    source: &dyn VolumeSource,
+    mut change: impl AsyncFnMut() -> VoxelBox,
+) -> Result<(), Violation> {
+    const RULE: &str = "tell what has changed since a revision";
+    const CHANGES: usize = 4;
+    let mut news = source.changes();
+    let mut made = Vec::new();
+    for _ in 0..CHANGES {
+        let before = source.revision();
+        let touched = change().await;
+        let mut told = VoxelBox::EMPTY;
+        while told.intersection(touched) != touched {
+            let Some(change) = news.next().await else {
+                return Err(violation(RULE, "the stream of changes ended"));
+            };
+            told = told.union(change.voxels);
+        }
+        made.push((before, touched));
+    }
+    for (n, &(since, _)) in made.iter().enumerate() {
+        let Some(told) = source.changes_after(since).await else {
+            return Err(violation(RULE, format!("of {since} nothing is known")));
+        };
+        let mut last = None;
+        for change in &told {
+            check_order(source, &mut last, *change)?;
+            ensure(change.revision > since, RULE, || {
+                format!("{change:?} is not after {since}")
+            })?;
+        }
+        for (_, touched) in &made[n..] {
+            let is_told = |voxel| told.iter().any(|change| change.voxels.contains(voxel));
+            ensure(touched.iter().all(is_told), RULE, || {
+                format!("{touched} changed after {since}, and only {told:?} is told")
+            })?;
+        }
+    }
+    let now = source.revision();
+    let nothing = source.changes_after(now).await;
+    ensure(nothing.as_ref().is_some_and(Vec::is_empty), RULE, || {
+        format!("{nothing:?} is after the newest revision {now}")
+    })?;
+    let other = source.changes_after(now + 1000).await;
+    ensure(other.is_none(), RULE, || {
+        format!("{other:?} is told after {}, which it never had", now + 1000)
+    })
+}
+
 fn check_order(
     source: &dyn VolumeSource,
     last: &mut Option<u64>,

@@ -30,6 +30,9 @@ enum Wrong {
     Stale,
     Backwards,
     PartlyMissed,
+    Forgetful,
+    AllKnowing,
+    Ignorant,
 }
 
 struct WrongSource {
@@ -84,6 +87,23 @@ impl VolumeSource for WrongSource {
         }))
     }
 
+    fn revision(&self) -> u64 {
+        self.inner.revision()
+    }
+
+    fn changes_after(&self, revision: u64) -> BoxFuture<'_, Option<Vec<Change>>> {
+        Box::pin(async move {
+            let mut told = self.inner.changes_after(revision).await;
+            match (self.wrong, &mut told) {
+                (Wrong::Forgetful, Some(told)) if !told.is_empty() => drop(told.remove(0)),
+                (Wrong::AllKnowing, None) => told = Some(Vec::new()),
+                (Wrong::Ignorant, told) => *told = None,
+                _ => {}
+            }
+            told
+        })
+    }
+
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
         let mut range = self.inner.value_range(id)?;
         range.max -= u16::from(self.wrong == Wrong::Range);
@@ -129,7 +149,16 @@ fn outcome(wrong: Wrong) -> Result<(), Violation> {
     };
     block_on(async {
         check_reading(&source, oracle, 0).await?;
-        check_changes(&source, 3, change, oracle, 0).await
+        check_changes(&source, 3, change, oracle, 0).await?;
+        let mut x = 0;
+        let change = async || {
+            x += 3;
+            let touched = VoxelBox::new(UVec3::new(x, 1, 1), UVec3::new(x + 2, 5, 6));
+            let values = vec![7; touched.voxels() as usize];
+            source.inner.set(touched, &values).unwrap();
+            touched
+        };
+        check_changes_after(&source, change).await
     })
 }
 
@@ -157,6 +186,9 @@ fn wrong_sources_do_not() {
             Wrong::PartlyMissed,
             "cover everything when changes were missed",
         ),
+        (Wrong::Forgetful, "tell what has changed since a revision"),
+        (Wrong::AllKnowing, "tell what has changed since a revision"),
+        (Wrong::Ignorant, "tell what has changed since a revision"),
     ] {
         assert_eq!(outcome(wrong).unwrap_err().rule, rule);
     }

@@ -1,4 +1,5 @@
-use std::sync::{Arc, PoisonError, RwLock, RwLockReadGuard};
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
 use glam::UVec3;
 use saccade_core::volume::Volume;
@@ -10,6 +11,9 @@ use crate::changes::Changes;
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::{Change, ChangeReason, Chunk, ChunkError, ChunkId, ValueRange, VolumeSource};
 
+/// Changes that are remembered.
+const KEPT: usize = 4096;
+
 /// A small 8-bit volume held whole, all its levels too. Voxels can be set while it is watched.
 ///
 /// Coarser levels are means of the level-0 voxels that are not 0; of labels, the most frequent, of several the
@@ -19,6 +23,8 @@ pub struct ArraySource {
     /// Per level `[c, z, y, x]`.
     levels: RwLock<Vec<Vec<u8>>>,
     changes: Arc<Changes>,
+    /// The newest changes.
+    log: Mutex<VecDeque<Change>>,
 }
 
 /// An array whose size is not that of the volume.
@@ -63,6 +69,7 @@ impl ArraySource {
         let levels = std::iter::once(level0).chain(coarser).collect();
         let source = Self {
             changes: Changes::new(whole, 0),
+            log: Mutex::default(),
             levels: RwLock::new(levels),
             volume,
         };
@@ -93,7 +100,23 @@ impl ArraySource {
             }
         }
         self.average(voxels);
-        Ok(self.changes.send_next(voxels, ChangeReason::Tile))
+        let reason = ChangeReason::Tile;
+        // Held until it is in there: who has heard of a change finds it.
+        let mut log = self.log();
+        let revision = self.changes.send_next(voxels, reason);
+        log.push_back(Change {
+            revision,
+            voxels,
+            reason,
+        });
+        if log.len() > KEPT {
+            log.pop_front();
+        }
+        Ok(revision)
+    }
+
+    fn log(&self) -> MutexGuard<'_, VecDeque<Change>> {
+        self.log.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn average(&self, level0: VoxelBox) {
@@ -147,6 +170,16 @@ impl VolumeSource for ArraySource {
 
     fn revision(&self) -> u64 {
         self.changes.revision()
+    }
+
+    fn changes_after(&self, revision: u64) -> BoxFuture<'_, Option<Vec<Change>>> {
+        let log = self.log();
+        let now = self.changes.revision();
+        // Every revision is one change.
+        let known = now - log.len() as u64..=now;
+        let after = { log.iter() }.filter(|change| change.revision > revision);
+        let after = known.contains(&revision).then(|| after.copied().collect());
+        Box::pin(std::future::ready(after))
     }
 
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {

@@ -13,7 +13,7 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
 use super::{RemoteError, RemoteOptions, RemoteSource};
-use crate::conformance::{check_changes, check_missed, check_reading};
+use crate::conformance::{check_changes, check_changes_after, check_missed, check_reading};
 use crate::memory::ArraySource;
 use crate::{ChangeReason, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
 use server::{Fault, Server, until};
@@ -97,6 +97,35 @@ fn changes_arrive_across_broken_connections() {
             .into_iter()
             .filter_map(|(_, last)| last);
         assert!(resumed.max() >= Some(2), "{:?}", server.requests("/events"));
+    });
+}
+
+/// Also where the server is in trouble for a moment, which is no reason to read everything anew.
+#[test]
+fn what_has_changed_since_a_revision_is_asked_for() {
+    run(async {
+        let (server, remote) = start().await;
+        let mut n = 0;
+        let change = async || {
+            n += 5;
+            let min = UVec3::new(n, 3, 1);
+            server.set(VoxelBox::new(min, min + 7), n as u8)
+        };
+        let trouble = [
+            Fault::Status("503 Service Unavailable"),
+            Fault::Status("500 Oops"),
+        ];
+        server.faults.lock().unwrap().extend(trouble);
+        check_changes_after(&remote, change).await.unwrap();
+        assert!(server.requests("/changes/").len() > 6);
+        // A server that has no such thing is not asked for ever.
+        let lasts = [Fault::Status("404 Not Found"); 5];
+        server.faults.lock().unwrap().extend(lasts);
+        assert_eq!(remote.changes_after(0).await, None);
+        assert!(server.faults.lock().unwrap().is_empty());
+        let refused = Fault::Status("400 Bad Request");
+        server.faults.lock().unwrap().push_back(refused);
+        assert_eq!(remote.changes_after(0).await, None);
     });
 }
 

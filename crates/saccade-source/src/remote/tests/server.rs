@@ -161,6 +161,17 @@ impl Server {
                     answer(&mut stream, "200 OK", text.as_bytes()).await?;
                 }
                 Some("v/v%201/events") => return self.events(stream, last).await,
+                Some(path) if path.starts_with("v/v%201/changes/") => {
+                    let fault = self.faults.lock().unwrap().pop_front();
+                    if let Some(Fault::Status(status)) = fault {
+                        answer(&mut stream, status, b"sorry").await?;
+                        continue;
+                    }
+                    let revision = path.rsplit('/').next().unwrap().parse().unwrap();
+                    let changes = self.source.changes_after(revision).await;
+                    let text = serde_json::json!({ "revision": 0, "changes": changes });
+                    answer(&mut stream, "200 OK", text.to_string().as_bytes()).await?;
+                }
                 Some(path) if path.starts_with("v/v%201/zarr/") => {
                     self.chunk(&mut stream, path).await?;
                 }
