@@ -15,6 +15,17 @@ use utoipa::{OpenApi, ToSchema};
 pub(crate) struct VolumeList {
     /// In order of their names.
     pub(crate) volumes: Vec<VolumeEntry>,
+    /// Those that should be there and cannot be opened now. The server tries again.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(crate) failing: Vec<FailingVolume>,
+}
+
+/// A volume that cannot be opened now.
+#[derive(Debug, Serialize, ToSchema)]
+pub(crate) struct FailingVolume {
+    pub(crate) name: String,
+    /// What is wrong, in words for people.
+    pub(crate) cause: String,
 }
 
 /// One volume on offer.

@@ -8,47 +8,67 @@ use saccade_archive::catalog::CatalogError;
 use saccade_source::SourceError;
 use saccade_source::stitched::{StitchedOptions, StitchedSource};
 
+use crate::http::cause;
+use crate::pieces::chain;
 use crate::status::CatalogStatus;
 use crate::volumes::Volumes;
 
-/// Why the volumes of an archive cannot be offered.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum OfferError {
-    /// The catalog cannot be read.
-    #[error(transparent)]
-    Catalog(#[from] CatalogError),
-    /// A volume cannot be opened.
-    #[error(transparent)]
-    Source(#[from] SourceError),
+/// What became of the volumes of an archive that were not offered yet.
+#[derive(Clone, Debug, Default)]
+pub struct Offer {
+    /// Names of those that are offered now.
+    pub new: Vec<String>,
+    /// Names of those that cannot be opened, and why. Clients are told so, and that they may ask again.
+    pub failing: Vec<(String, SourceError)>,
 }
 
-/// Offers the volumes of an archive that are not offered yet, and returns their names.
+/// Offers the volumes of an archive that are not offered yet. One that cannot be opened keeps no other from being offered.
 ///
 /// # Errors
 ///
-/// [`OfferError`]; the volumes before the one that failed are offered.
+/// If the catalog cannot be read.
 pub async fn offer_archive(
     volumes: &Volumes,
     archive: &VisualizationArchive,
     options: StitchedOptions,
-) -> Result<Vec<String>, OfferError> {
+) -> Result<Offer, CatalogError> {
     let offered = volumes.names();
-    let mut new = Vec::new();
-    for entry in archive.catalog().volumes().await? {
+    let entries = archive.catalog().volumes().await?;
+    volumes.keep_failing(|name| entries.iter().any(|entry| entry.volume.name == name));
+    let mut offer = Offer::default();
+    for entry in entries {
         let name = entry.volume.name;
         if offered.contains(&name) {
             continue;
         }
-        let source = StitchedSource::open(archive, &name, options.clone()).await?;
-        let status = CatalogStatus::new(archive.catalog().clone(), &name);
-        volumes.publish(Arc::new(source), Some(Arc::new(status)));
-        new.push(name);
+        match StitchedSource::open(archive, &name, options.clone()).await {
+            Ok(source) => {
+                let status = CatalogStatus::new(archive.catalog().clone(), &name);
+                volumes.publish(Arc::new(source), Some(Arc::new(status)));
+                offer.new.push(name);
+            }
+            Err(error) => {
+                if volumes.fail(&name, told(&error)) {
+                    let why = chain(&error);
+                    log::warn!("volume {name:?} cannot be offered, and is tried again: {why}");
+                }
+                offer.failing.push((name, error));
+            }
+        }
     }
-    Ok(new)
+    Ok(offer)
 }
 
-/// Offers volumes as they appear in an archive, looking every `poll`. Ends when it is dropped.
+/// Why a volume cannot be opened, as far as clients may know.
+fn told(error: &SourceError) -> String {
+    match error {
+        SourceError::Open { source, .. } => cause(&**source),
+        other => other.to_string(),
+    }
+}
+
+/// Offers volumes as they appear in an archive, and those that could not be opened, looking every `poll`. Ends when it is
+/// dropped.
 pub async fn follow_archive(
     volumes: &Volumes,
     archive: &VisualizationArchive,
@@ -58,7 +78,7 @@ pub async fn follow_archive(
     loop {
         tokio::time::sleep(poll).await;
         match offer_archive(volumes, archive, options.clone()).await {
-            Ok(new) => new
+            Ok(Offer { new, .. }) => new
                 .iter()
                 .for_each(|name| log::info!("volume {name:?} is offered now")),
             Err(error) => log::warn!("new volumes cannot be offered: {error}"),

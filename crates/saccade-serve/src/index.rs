@@ -21,6 +21,15 @@ pub(crate) fn index(volumes: &Volumes, request: &HeaderMap) -> Response {
     for published in volumes.all() {
         articles += &article(published.volume(), &published.version(), &base);
     }
+    for (name, cause) in volumes.failing() {
+        let (name, cause) = (escaped(&name), escaped(&cause));
+        // Writing to a string cannot fail.
+        let _ = write!(
+            articles,
+            "<article>\n<a></a>\n<div>\n<h2>{name}</h2>\n<p>cannot be opened now, and is tried again: {cause}</p>\n</div>\n\
+             </article>\n"
+        );
+    }
     if articles.is_empty() {
         articles = "<p>There are none yet. This page lists them as they appear.</p>".to_owned();
     }

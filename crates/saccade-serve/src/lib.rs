@@ -10,7 +10,7 @@
 //! | `/` | the browser application |
 //! | `/volumes` | a page that lists the volumes, with links that open them in other viewers |
 //! | `/openapi.json` | describes the answers in JSON |
-//! | `/volumes.json` | names and revisions |
+//! | `/volumes.json` | names and revisions; those that cannot be opened now, and why |
 //! | `/v/NAME/volume.json` | the description, the revision and the version |
 //! | `/v/NAME/status.json` | tiles, sections, files set aside |
 //! | `/v/NAME/events` | server-sent events, one per change |
@@ -42,7 +42,7 @@
 //! |---|---|
 //! | 404 | no such volume, level or chunk; with the header `saccade-nothing-acquired`, a chunk without voxels: the fill value |
 //! | 304, 412, 416 | what a client's own conditions ask for |
-//! | 503 with `Retry-After` | not ready, or a failure that may pass, which `cause` names |
+//! | 503 with `Retry-After` | not ready, or a failure that may pass, which `cause` names; also of a volume that cannot be opened now |
 //! | 503 with `Retry-After`, also | more connections, requests or event streams at once than [`Limits`] allow |
 //! | 421, 403 | a name that the server does not have, an origin that it does not let read ([`Access`]) |
 //! | 424 | what the voxels are read from is damaged: `cause` says what, and asking again does not help |
@@ -73,7 +73,9 @@ mod status;
 mod thumbnail;
 mod volumes;
 
-pub use archive::{OfferError, follow_archive, offer_archive};
+pub use archive::{Offer, follow_archive, offer_archive};
 pub use server::{Access, Compress, Limits, Options, Origins, ServeError, Server};
-pub use status::{CatalogStatus, DamagedTile, HeldUp, Quarantined, Status, StatusError, StatusSource};
+pub use status::{
+    CatalogStatus, DamagedTile, HeldUp, Quarantined, Status, StatusError, StatusSource,
+};
 pub use volumes::Volumes;

@@ -39,6 +39,9 @@ use crate::status::Status;
 use crate::thumbnail::thumbnail;
 use crate::volumes::{Published, Volumes};
 
+/// When to ask again for a volume that cannot be opened.
+const REOPENED: Duration = Duration::from_secs(2);
+
 /// What every handler needs.
 #[derive(Clone)]
 pub(crate) struct App(Arc<Shared>);
@@ -203,7 +206,10 @@ pub(crate) async fn volumes(State(app): State<App>) -> Response {
         revision: published.history().revision(),
     };
     let volumes = app.volumes.all().iter().map(entry).collect();
-    described(VolumeList { volumes })
+    let failing = { app.volumes.failing().into_iter() }
+        .map(|(name, cause)| FailingVolume { name, cause })
+        .collect();
+    described(VolumeList { volumes, failing })
 }
 
 /// What a volume is, and which state of it is offered now.
@@ -522,8 +528,14 @@ fn bad_request(error: String) -> Response {
 
 fn find(app: &App, name: &str) -> Result<Arc<Published>, Box<Response>> {
     app.volumes.get(name).ok_or_else(|| {
-        let error = format!("there is no volume {name:?}");
-        Box::new(not_found(error, app.volumes.names()))
+        let answer = match app.volumes.failure(name) {
+            Some(cause) => {
+                let error = format!("volume {name:?} cannot be opened now");
+                failing(error, cause, Some(REOPENED), StatusCode::NOT_FOUND)
+            }
+            None => not_found(format!("there is no volume {name:?}"), app.volumes.names()),
+        };
+        Box::new(answer)
     })
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::hash::{BuildHasher, RandomState};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -24,7 +24,14 @@ const TELL_AGAIN: Duration = Duration::from_secs(60);
 
 /// The volumes on offer, by name. Clones share the same set, which may grow at any time.
 #[derive(Clone, Default)]
-pub struct Volumes(Arc<RwLock<BTreeMap<String, Arc<Published>>>>);
+pub struct Volumes(Arc<RwLock<Offered>>);
+
+#[derive(Default)]
+struct Offered {
+    published: BTreeMap<String, Arc<Published>>,
+    /// Those that should be offered and cannot be opened, and why, in words for clients.
+    failing: BTreeMap<String, String>,
+}
 
 impl Volumes {
     /// No volumes.
@@ -39,37 +46,53 @@ impl Volumes {
     pub fn publish(&self, source: Arc<dyn VolumeSource>, status: Option<Arc<dyn StatusSource>>) {
         let published = Arc::new(Published::new(source, status));
         let name = published.volume().name.clone();
-        self.0
-            .write()
-            .unwrap_or_else(PoisonError::into_inner)
-            .insert(name, published);
+        let mut offered = self.write();
+        offered.failing.remove(&name);
+        offered.published.insert(name, published);
+    }
+
+    /// Lists a volume as one that cannot be offered now, and why. Whether that is news.
+    pub(crate) fn fail(&self, name: &str, cause: String) -> bool {
+        let mut offered = self.write();
+        let before = offered.failing.insert(name.to_owned(), cause);
+        before.as_ref() != offered.failing.get(name)
+    }
+
+    /// Forgets failing volumes of which there are none any more.
+    pub(crate) fn keep_failing(&self, mut is_there: impl FnMut(&str) -> bool) {
+        self.write().failing.retain(|name, _| is_there(name));
+    }
+
+    /// Why that volume cannot be offered now, if it should be.
+    pub(crate) fn failure(&self, name: &str) -> Option<String> {
+        self.read().failing.get(name).cloned()
+    }
+
+    /// Those that cannot be offered now, and why.
+    pub(crate) fn failing(&self) -> Vec<(String, String)> {
+        let of = |(name, cause): (&String, &String)| (name.clone(), cause.clone());
+        self.read().failing.iter().map(of).collect()
+    }
+
+    fn read(&self) -> RwLockReadGuard<'_, Offered> {
+        self.0.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn write(&self) -> RwLockWriteGuard<'_, Offered> {
+        self.0.write().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Names, in order.
     pub fn names(&self) -> Vec<String> {
-        self.0
-            .read()
-            .unwrap_or_else(PoisonError::into_inner)
-            .keys()
-            .cloned()
-            .collect()
+        self.read().published.keys().cloned().collect()
     }
 
     pub(crate) fn all(&self) -> Vec<Arc<Published>> {
-        self.0
-            .read()
-            .unwrap_or_else(PoisonError::into_inner)
-            .values()
-            .cloned()
-            .collect()
+        self.read().published.values().cloned().collect()
     }
 
     pub(crate) fn get(&self, name: &str) -> Option<Arc<Published>> {
-        self.0
-            .read()
-            .unwrap_or_else(PoisonError::into_inner)
-            .get(name)
-            .cloned()
+        self.read().published.get(name).cloned()
     }
 }
 

@@ -136,7 +136,10 @@ impl Demo {
         };
         archive.catalog().create_volume(&info.volume()?).await?;
         let volumes = Volumes::new();
-        offer_archive(&volumes, archive, StitchedOptions::default()).await?;
+        let offer = offer_archive(&volumes, archive, StitchedOptions::default()).await?;
+        if let Some((_, error)) = offer.failing.into_iter().next() {
+            return Err(error.into());
+        }
         let url = server.url();
         tell(&url);
         if !self.no_open {

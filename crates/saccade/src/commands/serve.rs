@@ -99,8 +99,12 @@ impl Serve {
             let archive = waited_for(|| VisualizationArchive::open(&location)).await?;
             let server = Server::bind(self.at.address()).await?;
             let options = self.stitching.options(&location).await?;
-            let offered = offer_archive(&volumes, &archive, options.clone()).await?;
-            if offered.is_empty() {
+            let offer = offer_archive(&volumes, &archive, options.clone()).await?;
+            if let ([], Some((_, error))) = (&*offer.new, offer.failing.first()) {
+                // There is nothing to look at, and somebody who can mend it.
+                return Err(error.clone().into());
+            }
+            if offer.new.is_empty() {
                 say("the archive holds no volumes yet; they are offered as they appear");
             }
             anyhow::Ok((archive, server, options))

@@ -6,6 +6,7 @@ mod demo;
 mod errors;
 mod export_power_cuts;
 mod failed_sync;
+mod failing_volume;
 mod images;
 mod kills;
 mod labels;
