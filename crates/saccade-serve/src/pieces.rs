@@ -80,7 +80,9 @@ async fn conditional(
         }
     };
     // A change during the read leaves open which state this is: then it goes without a tag.
-    let tag = Some(tag).filter(|tag| published.tag(place) == *tag);
+    // It may be the read that noticed it: then the news is on its way.
+    let is_known = published.is_caught_up().await;
+    let tag = Some(tag).filter(|tag| is_known && published.tag(place) == *tag);
     let lasts = tag.is_some() && version.is_some_and(|v| published.is_as_in(v, place));
     let cache = if lasts { KEEP } else { REVALIDATE };
     answer(voxels, tag.as_ref(), cache, headers)

@@ -22,6 +22,9 @@ use crate::status::StatusSource;
 /// Between two messages that chunks of a volume take long.
 const TELL_AGAIN: Duration = Duration::from_secs(60);
 
+/// Longest wait for news that are on their way.
+const NEWS: Duration = Duration::from_millis(100);
+
 /// The volumes on offer, by name. Clones share the same set, which may grow at any time.
 #[derive(Clone, Default)]
 pub struct Volumes(Arc<RwLock<Offered>>);
@@ -172,6 +175,18 @@ impl Published {
     /// Yields the position behind the last change whenever it grows.
     pub(crate) fn end(&self) -> watch::Receiver<u64> {
         self.end.clone()
+    }
+
+    /// Waits until all that its source knows to have changed is in the tags; `false` if that takes too long.
+    pub(crate) async fn is_caught_up(&self) -> bool {
+        let now = self.source.revision();
+        let is_there = || self.history().revision() >= now;
+        if is_there() {
+            return true;
+        }
+        let mut end = self.end();
+        let news = async { while !is_there() && end.changed().await.is_ok() {} };
+        tokio::time::timeout(NEWS, news).await.is_ok() && is_there()
     }
 
     /// Names the state of a chunk of a level: equal tags, equal bytes.

@@ -133,6 +133,10 @@ impl VolumeSource for PrecomputedSource {
     fn changes(&self) -> BoxStream<'static, Change> {
         self.stored.changes()
     }
+
+    fn revision(&self) -> u64 {
+        self.stored.revision()
+    }
 }
 
 /// The volume that an `info` describes.

@@ -6,7 +6,9 @@
 mod piece;
 mod placed;
 mod sample;
+mod watch;
 
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -24,6 +26,7 @@ use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 pub(crate) use piece::{ChunkMut, Place, copy, fill};
 pub(crate) use placed::Placed;
 pub(crate) use sample::{Sample, sampled};
+use watch::Watch;
 
 /// Decoded chunks that are kept, all levels together \[bytes\]. A page has 4 GB at most, and shares it with what it shows.
 const CACHE_BYTES: u64 = if cfg!(target_family = "wasm") {
@@ -129,15 +132,41 @@ pub(crate) trait Stored: MaybeSend + MaybeSync + 'static {
 pub(crate) struct StoredSource<F> {
     format: Arc<F>,
     pieces: Arc<Flights<PieceId, Piece, PieceError>>,
+    watch: Watch,
 }
 
 impl<F: Stored> StoredSource<F> {
     /// `piece_bytes` is about what a decoded piece takes.
     pub(crate) fn new(format: F, piece_bytes: u64) -> Self {
+        Self::keeping(format, CACHE_BYTES, piece_bytes)
+    }
+
+    /// The same, with another number of bytes that are kept.
+    fn keeping(format: F, bytes: u64, piece_bytes: u64) -> Self {
         Self {
+            watch: Watch::new(VoxelBox::of_size(format.volume().extent())),
             format: Arc::new(format),
-            pieces: Flights::new(CACHE_BYTES, piece_bytes),
+            pieces: Flights::new(bytes, piece_bytes),
         }
+    }
+
+    /// Reads pieces of a level, and notices those that have changed.
+    fn start(
+        &self,
+        level: u32,
+        places: &[(PieceId, Place)],
+        missing: Vec<PieceId>,
+    ) -> Vec<(Vec<PieceId>, Pieces)> {
+        let (placed, volume) = (self.format.placed(level), self.format.volume());
+        let voxels = |own: VoxelBox| {
+            let level0 = volume.levels[level as usize].voxels_from_box(placed.whole(own));
+            level0.intersection(VoxelBox::of_size(volume.extent()))
+        };
+        let places = places.iter().map(|(id, place)| (*id, voxels(place.voxels)));
+        let places: Arc<HashMap<PieceId, VoxelBox>> = Arc::new(places.collect());
+        let work = self.format.read(missing).into_iter();
+        work.map(|(ids, work)| (ids, self.watch.over(places.clone(), work)))
+            .collect()
     }
 
     async fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
@@ -150,7 +179,7 @@ impl<F: Stored> StoredSource<F> {
         let ids: Vec<PieceId> = touched.iter().map(|(piece, _)| *piece).collect();
         let pieces = self
             .pieces
-            .get(&ids, |missing| self.format.read(missing))
+            .get(&ids, |missing| self.start(id.level, &touched, missing))
             .await;
         let mut found = Vec::with_capacity(pieces.len());
         for (piece, (_, place)) in pieces.into_iter().zip(touched) {
@@ -236,9 +265,13 @@ impl<F: Stored> VolumeSource for StoredSource<F> {
         self.format.values().renamed()
     }
 
-    /// Nobody tells of changes in files.
+    /// Those that are noticed when something is read again.
     fn changes(&self) -> BoxStream<'static, Change> {
-        Box::pin(futures::stream::pending())
+        self.watch.stream()
+    }
+
+    fn revision(&self) -> u64 {
+        self.watch.revision()
     }
 }
 

@@ -180,6 +180,10 @@ impl VolumeSource for ZarrSource {
     fn changes(&self) -> BoxStream<'static, Change> {
         self.stored.changes()
     }
+
+    fn revision(&self) -> u64 {
+        self.stored.revision()
+    }
 }
 
 /// The JSON of an object; `None` if there is none.

@@ -1,15 +1,20 @@
 //! Voxels, and the conditions under which they are sent.
 
 use std::io::Read;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use glam::UVec3;
 use reqwest::header::{ACCEPT_ENCODING, CONTENT_LENGTH, IF_MATCH, IF_NONE_MATCH, IF_RANGE, RANGE};
 use reqwest::{Method, StatusCode};
+use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_serve::{Compress, Options};
-use saccade_source::{Chunk, ChunkId, VolumeSource};
+use saccade_source::maybe_send::{BoxFuture, BoxStream};
+use saccade_source::memory::ArraySource;
+use saccade_source::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 
-use super::{CHUNK, EXTENT, Served, header, run, serve, value};
+use super::{CHUNK, EXTENT, Served, header, level0, run, serve, serve_source, value, volume};
 
 fn key(level: usize, chunk: UVec3) -> String {
     format!("v/em/zarr/{level}/c/0/{}/{}/{}", chunk.z, chunk.y, chunk.x)
@@ -316,5 +321,70 @@ fn near_clients_are_spared_compression() {
         };
         assert_eq!(of(&key(0, HERE)).await, None);
         assert_eq!(of("v/em/zarr/zarr.json").await.as_deref(), Some("gzip"));
+    });
+}
+
+/// An image that is written anew where it is kept, which is noticed when it is read again.
+struct Rewritten {
+    array: ArraySource,
+    voxels: VoxelBox,
+    is_rewritten: AtomicBool,
+}
+
+impl VolumeSource for Rewritten {
+    fn volume(&self) -> &Arc<Volume> {
+        self.array.volume()
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        if self.is_rewritten.swap(false, Ordering::SeqCst) {
+            self.array.set(self.voxels, &[77]).unwrap();
+        }
+        self.array.read(id)
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        self.array.changes()
+    }
+
+    fn revision(&self) -> u64 {
+        self.array.revision()
+    }
+}
+
+/// Also in the answer of the very read that noticed it: equal tags, equal bytes.
+#[test]
+fn voxels_that_turn_out_to_be_others_have_another_tag() {
+    run(async {
+        let min = HERE * CHUNK;
+        let source = Arc::new(Rewritten {
+            array: ArraySource::new(volume(), level0()).unwrap(),
+            voxels: VoxelBox::new(min, min + 1),
+            is_rewritten: AtomicBool::new(false),
+        });
+        let (url, _stop, _) = serve_source(source.clone(), Options::DEFAULT).await;
+        let client = reqwest::Client::new();
+        let get = async |held: Option<&str>| {
+            let mut request = client.get(format!("{url}{}", key(0, HERE)));
+            if let Some(held) = held {
+                request = request.header(IF_NONE_MATCH, held);
+            }
+            let answer = request.send().await.unwrap();
+            let tag = header(answer.headers(), "etag").map(str::to_owned);
+            (answer.status(), tag, answer.bytes().await.unwrap())
+        };
+        for _ in 0..20 {
+            let (_, first, _) = get(None).await;
+            let first = first.expect("what is known to be so has a tag");
+            let (held, ..) = get(Some(&first)).await;
+            assert_eq!(held, StatusCode::NOT_MODIFIED);
+            source.is_rewritten.store(true, Ordering::SeqCst);
+            let (_, second, after) = get(None).await;
+            assert_eq!(after[0], 77);
+            assert_ne!(second.as_ref(), Some(&first));
+            let (now, third, voxels) = get(Some(&first)).await;
+            assert_eq!((now, voxels), (StatusCode::OK, after));
+            assert!(second.is_none() || second == third, "{second:?} {third:?}");
+        }
     });
 }

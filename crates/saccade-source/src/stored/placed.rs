@@ -84,6 +84,16 @@ impl Placed {
         Some((own, inside.as_uvec3()))
     }
 
+    /// Where a box of its own voxels lies in the level, as far as there are such voxels.
+    pub(crate) fn whole(&self, own: VoxelBox) -> VoxelBox {
+        let place = |at: UVec3| {
+            let at = at.as_i64vec3().saturating_add(self.begin);
+            at.clamp(I64Vec3::ZERO, I64Vec3::splat(u32::MAX.into()))
+                .as_uvec3()
+        };
+        VoxelBox::new(place(own.min), place(own.max))
+    }
+
     /// What of a level of this name is not as one expects, in words: that it begins elsewhere than the volume, or ends
     /// elsewhere, as if the finest one had another size. `extent` is what [`Self::level`] made of it.
     pub(crate) fn note(&self, level: &str, extent: UVec3) -> Option<String> {
