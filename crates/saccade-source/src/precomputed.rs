@@ -4,6 +4,9 @@
 //! levels and channels. Where a store compresses in transport, copies of it are read as well, in folders and over HTTP (`NAME.gz`, or
 //! compressed without saying so).
 //!
+//! JPEG is decoded by libjpeg-turbo, to the last bit as with most other programs; in browsers by another decoder, which fills in colours
+//! that are stored for several pixels at a time (4:2:0) otherwise: such values may be some steps (4 of 255) away.
+//!
 //! The finest level is where the volume is, and how far that is from 0, 0, 0 is kept in
 //! [`Volume::origin_nm`](saccade_core::volume::Volume::origin_nm); others lie where their `voxel_offset` says, which may be off by less than one of their
 //! voxels, since it is rounded.

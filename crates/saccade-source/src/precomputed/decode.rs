@@ -1,10 +1,16 @@
 //! Numbers of a chunk, from its bytes.
 
+#[cfg(not(target_family = "wasm"))]
+#[path = "decode/jpeg_native.rs"]
+mod jpeg;
+#[cfg(target_family = "wasm")]
+#[path = "decode/jpeg_wasm.rs"]
+mod jpeg;
+
 use std::io::Cursor;
 
 use bytes::Bytes;
 use glam::UVec3;
-use image::codecs::jpeg::JpegDecoder;
 use image::codecs::png::PngDecoder;
 use image::{ExtendedColorType, ImageDecoder};
 use serde::{Deserialize, Serialize};
@@ -61,10 +67,7 @@ fn decode(encoding: Encoding, shape: Shape, mut bytes: Bytes) -> Result<Bytes, D
     }
     match encoding {
         Encoding::Raw => {}
-        Encoding::Jpeg => {
-            let decoder = JpegDecoder::new(Cursor::new(&*bytes));
-            bytes = picture(decoder.map_err(damage)?, shape)?;
-        }
+        Encoding::Jpeg => bytes = jpeg::decode(&bytes, shape)?,
         Encoding::Png => {
             let decoder = PngDecoder::new(Cursor::new(&*bytes));
             bytes = picture(decoder.map_err(damage)?, shape)?;
@@ -81,20 +84,25 @@ fn decode(encoding: Encoding, shape: Shape, mut bytes: Bytes) -> Result<Bytes, D
     }
 }
 
-fn damage(error: image::ImageError) -> Damage {
+fn damage(error: impl std::fmt::Display) -> Damage {
     format!("its picture does not decode: {error}")
+}
+
+/// Whether a picture has as many pixels as a chunk has voxels.
+fn check_pixels(width: u64, height: u64, shape: Shape) -> Result<(), Damage> {
+    if width.checked_mul(height) == Some(shape.voxels() as u64) {
+        return Ok(());
+    }
+    let voxels = shape.size;
+    Err(format!(
+        "its picture has {width} x {height} pixels for {voxels} voxels"
+    ))
 }
 
 /// Pixels of a picture, channel after channel.
 fn picture(decoder: impl ImageDecoder, shape: Shape) -> Result<Bytes, Damage> {
     let (width, height) = decoder.dimensions();
-    let pixels = u64::from(width) * u64::from(height);
-    if pixels != shape.voxels() as u64 {
-        let voxels = shape.size;
-        return Err(format!(
-            "its picture has {width} x {height} pixels for {voxels} voxels"
-        ));
-    }
+    check_pixels(width.into(), height.into(), shape)?;
     let color = decoder.color_type();
     let (channels, width) = (usize::from(color.channel_count()), shape.number.bytes());
     let deep = matches!(ExtendedColorType::from(color).bits_per_pixel(), bits if usize::from(bits) == channels * width * 8);
@@ -111,8 +119,13 @@ fn picture(decoder: impl ImageDecoder, shape: Shape) -> Result<Bytes, Damage> {
             *value = u16::from_ne_bytes(*value).to_le_bytes();
         }
     }
+    Ok(planes(mixed, channels, width))
+}
+
+/// Channel after channel, of pixels whose channels are mixed, of so many bytes each.
+fn planes(mixed: Vec<u8>, channels: usize, width: usize) -> Bytes {
     if channels == 1 {
-        return Ok(mixed.into());
+        return mixed.into();
     }
     let mut planes = Vec::with_capacity(mixed.len());
     for channel in 0..channels {
@@ -120,7 +133,7 @@ fn picture(decoder: impl ImageDecoder, shape: Shape) -> Result<Bytes, Damage> {
             planes.extend_from_slice(&pixel[channel * width..][..width]);
         }
     }
-    Ok(planes.into())
+    planes.into()
 }
 
 /// Blocks that have a table each, and voxels that are numbers of entries in it.
