@@ -6,7 +6,7 @@ use std::str::FromStr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use saccade_archive::catalog::CatalogError;
 use saccade_archive::{
     ArchiveError, ArchiveLocation, CatalogLocation, StorageLocation, VisualizationArchive,
@@ -90,6 +90,19 @@ fn passes(error: &CatalogError) -> bool {
         }
     );
     empty || error.is_outage()
+}
+
+/// By what opening an archive failed: where there is none, and none was asked for in particular, there is no image either.
+pub(crate) fn neither(error: anyhow::Error, catalog: &CatalogArgument) -> anyhow::Error {
+    match error.downcast_ref() {
+        Some(ArchiveError::NotAnArchive { path }) if !catalog.is_given() => anyhow!(
+            "there is no visualization archive ({}), which `saccade ingest` or `saccade demo` makes, and no image, neither \
+             OME-Zarr (zarr.json, .zattrs) nor precomputed (info): {}",
+            VisualizationArchive::CATALOG,
+            path.parent().unwrap_or(path).display()
+        ),
+        _ => error,
+    }
 }
 
 /// Refuses what an export has left that is not whole, which is neither an image nor an archive.
@@ -235,7 +248,8 @@ impl Place {
             }
             Self::Bucket(storage, _) | Self::Archive(storage) => {
                 let location = Self::archive(storage, catalog)?;
-                let archive = VisualizationArchive::open(&location).await?;
+                let archive = VisualizationArchive::open(&location).await;
+                let archive = archive.map_err(|error| neither(error.into(), catalog))?;
                 let options = stitching.options(&location).await?;
                 let name = match name {
                     Some(name) => name.to_owned(),

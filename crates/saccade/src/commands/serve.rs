@@ -10,7 +10,7 @@ use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, o
 
 use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
-use crate::open::{Place, waited_for};
+use crate::open::{Place, neither, waited_for};
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
 
@@ -96,7 +96,8 @@ impl Serve {
         let mut interrupted = Box::pin(interrupted());
         let volumes = Volumes::new();
         let prepare = async {
-            let archive = waited_for(|| VisualizationArchive::open(&location)).await?;
+            let archive = waited_for(|| VisualizationArchive::open(&location)).await;
+            let archive = archive.map_err(|error| neither(error, &self.catalog))?;
             let server = Server::bind(self.at.address()).await?;
             let options = self.stitching.options(&location).await?;
             let offer = offer_archive(&volumes, &archive, options.clone()).await?;

@@ -279,3 +279,60 @@ fn what_is_no_image_says_what_was_looked_for() {
         stderr(&output)
     );
 }
+
+/// A store that knows no such bucket says so in XML, whatever it is asked.
+#[test]
+fn an_export_to_a_bucket_that_is_not_there_says_how_to_mend_it() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("http://{}", listener.local_addr().unwrap());
+    std::thread::spawn(move || {
+        for stream in listener.incoming() {
+            std::thread::spawn(move || {
+                let mut stream = stream.unwrap();
+                let mut asked = BufReader::new(stream.try_clone().unwrap());
+                loop {
+                    let (mut line, mut length) = (String::new(), 0_u64);
+                    while line != "\r\n" {
+                        line.clear();
+                        if asked.read_line(&mut line).unwrap_or(0) == 0 {
+                            return;
+                        }
+                        let header = line.to_ascii_lowercase();
+                        if let Some(told) = header.strip_prefix("content-length:") {
+                            length = told.trim().parse().unwrap();
+                        }
+                    }
+                    let mut body = Vec::new();
+                    asked.by_ref().take(length).read_to_end(&mut body).unwrap();
+                    let xml = "<?xml version=\"1.0\"?><Error><Code>NoSuchBucket</Code><Message>The specified bucket does not \
+                               exist</Message><BucketName>nowhere</BucketName></Error>";
+                    let head = format!(
+                        "HTTP/1.1 404 Not Found\r\ncontent-type: application/xml\r\ncontent-length: {}\r\n\r\n",
+                        xml.len()
+                    );
+                    if stream.write_all(format!("{head}{xml}").as_bytes()).is_err() {
+                        return;
+                    }
+                }
+            });
+        }
+    });
+    let folder = tempfile::tempdir().unwrap();
+    let archive = crate::archive(folder.path());
+    let output = saccade()
+        .args(["export", &archive, "s3://nowhere/image.zarr"])
+        .env("AWS_ENDPOINT_URL", &endpoint)
+        .env("AWS_ACCESS_KEY_ID", "id")
+        .env("AWS_SECRET_ACCESS_KEY", "secret")
+        .env("AWS_REGION", "us-east-1")
+        .output()
+        .unwrap();
+    let parts = ["no such bucket; make it first", "s3://nowhere/image.zarr"];
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(parts.iter().all(|part| said.contains(part)), "{said}");
+    assert!(
+        said.contains("NoSuchBucket: The specified") && !said.contains("<Code>"),
+        "{said}"
+    );
+}
