@@ -38,6 +38,8 @@ pub mod precomputed;
 #[cfg(not(target_family = "wasm"))]
 mod processors;
 pub mod remote;
+#[cfg(all(test, not(target_family = "wasm")))]
+mod shared;
 mod source;
 #[cfg(not(target_family = "wasm"))]
 pub mod stitched;

@@ -693,6 +693,12 @@ fn microscope_tiles_decode() {
         shared.unwrap_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared"));
     let dir = shared.join("data/at-tutorial-tiles");
     if !dir.is_dir() {
+        let is_named = std::env::var_os("SACCADE_SHARED").is_some();
+        assert!(
+            !is_named,
+            "SACCADE_SHARED is set, but {} is not there",
+            dir.display()
+        );
         eprintln!("skipped: no data in {}", dir.display());
         return;
     }

@@ -563,6 +563,12 @@ fn shared(folder: &str) -> Option<PathBuf> {
     if path.is_dir() {
         return Some(path);
     }
+    let is_named = std::env::var_os("SACCADE_SHARED").is_some();
+    assert!(
+        !is_named,
+        "SACCADE_SHARED is set, but {} is not there",
+        path.display()
+    );
     let text = format!("skipped: {} is not there\n", path.display());
     io::Write::write_all(&mut io::stderr(), text.as_bytes()).unwrap();
     None

@@ -358,17 +358,14 @@ async fn chunks_that_are_called_gz_are_found() {
 /// Segmentations of a real brain by cloud-volume and tensorstore, if they are there.
 #[tokio::test]
 async fn real_volumes_open() {
-    let data =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/derived-refwriters/dev");
     for (name, extent) in [
         ("precomputed_gray_raw_unsharded", UVec3::new(140, 135, 130)),
         ("precomputed_seg_cseg_sharded", UVec3::splat(250)),
         ("precomputed_pinky40_16nm_cseg_u32_gz", UVec3::splat(512)),
     ] {
-        let folder = data.join(name);
-        if !folder.is_dir() {
-            return;
-        }
+        let Some(folder) = crate::shared::data(&format!("derived-refwriters/dev/{name}")) else {
+            continue;
+        };
         let source = PrecomputedSource::open(Arc::new(FolderObjects::new(&folder)), name)
             .await
             .unwrap();

@@ -597,12 +597,11 @@ proptest! {
 /// fourth voxel here, from the fourth on.
 #[test]
 fn two_versions_of_a_real_image_agree() {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
-    let old = data.join("idr0062-6001240-ngff01/6001240.zarr");
-    let new = data.join("idr0062-6001240-ngff05/6001240_labels_v0.5.zarr");
-    if !old.is_dir() {
+    let old = crate::shared::data("idr0062-6001240-ngff01/6001240.zarr");
+    let new = crate::shared::data("idr0062-6001240-ngff05/6001240_labels_v0.5.zarr");
+    let (Some(old), Some(new)) = (old, new) else {
         return;
-    }
+    };
     let (old, new) = (open(&old).unwrap(), open(&new).unwrap());
     assert_eq!(old.volume().channels, ["LaminB1", "Dapi"]);
     assert_eq!(old.volume().channels, new.volume().channels);

@@ -482,6 +482,12 @@ fn zarrs_of_other_writers_are_stacks() {
         .join("data");
     let source = shared.join("fib25-medulla/training_sample2/grayscale_maps");
     if !source.is_dir() {
+        let is_named = std::env::var_os("SACCADE_SHARED").is_some();
+        assert!(
+            !is_named,
+            "SACCADE_SHARED is set, but {} is not there",
+            source.display()
+        );
         let text = format!("skipped: {} is not there\n", source.display());
         std::io::Write::write_all(&mut std::io::stderr(), text.as_bytes()).unwrap();
         return;
