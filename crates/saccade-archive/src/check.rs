@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use crate::VisualizationArchive;
 use crate::acquisition::{Cursor, Record, RecordReader, TileRecord, image_path};
-use crate::catalog::{CatalogError, Quarantined, Tile, VolumeEntry, Waiting, place};
+use crate::catalog::{CatalogError, Origin, Quarantined, Tile, VolumeEntry, Waiting, place};
 use crate::pyramid::{self, PyramidError, Verified};
 use crate::storage::{Entry, StorageError};
 
@@ -89,7 +89,10 @@ pub struct Finding {
 impl Finding {
     /// Whether it is mended, or will be.
     fn is_mended(&self) -> bool {
-        matches!(self.repair, Some(Repair::Queued | Repair::Recounted))
+        matches!(
+            self.repair,
+            Some(Repair::Queued | Repair::Recounted | Repair::Moved)
+        )
     }
 }
 
@@ -125,6 +128,8 @@ pub enum Repair {
     Queued,
     /// The tiles were counted anew.
     Recounted,
+    /// The tile lies where its records say.
+    Moved,
     /// The tile is in quarantine, for its record or image is not to be had.
     Quarantined,
 }
@@ -172,7 +177,9 @@ pub enum CheckError {
 /// missing or damaged is given back to ingest if the acquisition still has its record and image,
 /// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
 /// damaged object: ingest replaces it. A folder in the place of a pyramid is found as damage and not repaired:
-/// somebody has to take it away first. Wrong counts are made right.
+/// somebody has to take it away first. Wrong counts are made right. A tile that lies outside of the volume is moved to
+/// where its records say, and of tiles that name one pyramid, those of whose records it was not made are given back to
+/// ingest.
 ///
 /// # Errors
 ///
@@ -193,6 +200,8 @@ pub async fn check(
         report: CheckReport::default(),
         hasher: RandomState::new(),
         named: HashSet::new(),
+        shared: HashSet::new(),
+        given_back: HashSet::new(),
     };
     for volume in &volumes {
         check.volume(volume).await?;
@@ -215,6 +224,10 @@ struct Check<'a> {
     hasher: RandomState,
     /// Hashes of the names that the catalog knows: millions of names would take much memory.
     named: HashSet<u64>,
+    /// Pyramids of which it was found that several tiles name them.
+    shared: HashSet<String>,
+    /// Volume and name of tiles that were given back for that.
+    given_back: HashSet<(String, String)>,
 }
 
 impl Check<'_> {
@@ -299,14 +312,17 @@ impl Check<'_> {
         tile: &Tile,
         looked: Result<(Verified, u64), PyramidError>,
     ) -> Result<(), CheckError> {
+        let known = (entry.volume.name.clone(), tile.name.clone());
+        if self.given_back.contains(&known) {
+            return Ok(());
+        }
         let extent = entry.volume.extent();
         if place(extent, tile.section, tile.size, tile.transform).is_none() {
-            let reason = format!("its transform {:?} is none", tile.transform.elements());
-            self.find(FindingKind::Misplaced, entry, Some(tile), reason);
+            self.misplaced(entry, tile).await?;
         }
         if !self.named.insert(self.hasher.hash_one(&tile.pyramid)) {
-            let reason = "another tile names the same pyramid".to_owned();
-            self.find(FindingKind::Shared, entry, Some(tile), reason);
+            // It was looked at with the first of them.
+            return self.shared(entry, tile).await;
         }
         let (kind, reason) = match looked {
             Ok((verified, len)) => {
@@ -318,6 +334,12 @@ impl Check<'_> {
                     return self.mend(FindingKind::Mistaken, entry, tile, reason).await;
                 }
                 if [level.width, level.height] == tile.size.to_array() {
+                    return Ok(());
+                }
+                let catalog = self.archive.catalog();
+                let named = catalog.origins(&entry.volume.name, &tile.pyramid).await?;
+                if named.len() > 1 {
+                    // Found with the next of them.
                     return Ok(());
                 }
                 let reason = format!(
@@ -386,6 +408,122 @@ impl Check<'_> {
         })
     }
 
+    /// A tile lies where no voxel is.
+    async fn misplaced(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<(), CheckError> {
+        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
+        let mut reason = format!(
+            "it lies outside of the volume (section {}, transform {:?})",
+            tile.section,
+            tile.transform.elements()
+        );
+        let mut repair = None;
+        if self.options.repair {
+            let read = catalog.cursor(volume).await?;
+            let origins = catalog.origins(volume, &tile.pyramid).await?;
+            let origin = origins.into_iter().find(|origin| origin.tile == tile.name);
+            let said = origin.and_then(|origin| {
+                // The newest that leads anywhere.
+                let of = [origin.transform_position, origin.position];
+                let said = |at| match self.record_at(entry, at, read)?.1 {
+                    Record::Tile(record) if record.tile == tile.name => Some(record.transform),
+                    Record::Transform(record) if record.tile == tile.name => Some(record.transform),
+                    _ => None,
+                };
+                let extent = entry.volume.extent();
+                let inside = |to: &_| place(extent, tile.section, tile.size, *to).is_some();
+                of.into_iter().filter_map(said).find(inside)
+            });
+            if let Some(transform) = said {
+                catalog.set_transform(volume, &tile.name, transform).await?;
+                repair = Some(Repair::Moved);
+            } else {
+                reason.push_str(
+                    ", and no record is to be had that says where it lies: name the folder of the acquisition with \
+                     --acquisition, or say with `saccade update` where it lies, or that it is no more",
+                );
+            }
+        }
+        self.find(FindingKind::Misplaced, entry, Some(tile), reason)
+            .repair = repair;
+        Ok(())
+    }
+
+    /// A tile names a pyramid that one before it names, too. It was made of one record: the tiles of others are found.
+    async fn shared(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<(), CheckError> {
+        if !self.shared.insert(tile.pyramid.clone()) {
+            return Ok(());
+        }
+        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
+        let origins = catalog.origins(volume, &tile.pyramid).await?;
+        let made_of = position_of(&tile.pyramid);
+        let owner = |origin: &&Origin| Some(origin.position) == made_of;
+        let mut owners = origins.iter().filter(owner);
+        let owner = owners.next().filter(|_| owners.next().is_none());
+        // All of them at once. Where only one is left, somebody has mended it since it was listed.
+        let others = origins.iter().filter(|origin| owner != Some(*origin));
+        for origin in others.filter(|_| origins.len() > 1) {
+            let reason = match owner {
+                Some(owner) => format!("it names the pyramid of tile {}", owner.tile),
+                None => "it names a pyramid that others name, too, and that is nobody's".to_owned(),
+            };
+            let mut repair = None;
+            if self.options.repair {
+                repair = Some(self.give_back(entry, origin, &reason).await?);
+                let given_back = (volume.clone(), origin.tile.clone());
+                self.given_back.insert(given_back);
+            }
+            self.report.findings.push(Finding {
+                kind: FindingKind::Shared,
+                volume: Some(volume.clone()),
+                tile: Some(origin.tile.clone()),
+                object: Some(tile.pyramid.clone()),
+                reason,
+                repair,
+            });
+        }
+        Ok(())
+    }
+
+    /// Takes a pyramid that is not its own from a tile, and has it made anew.
+    async fn give_back(
+        &self,
+        entry: &VolumeEntry,
+        origin: &Origin,
+        reason: &str,
+    ) -> Result<Repair, CheckError> {
+        let catalog = self.archive.catalog();
+        let read = catalog.cursor(&entry.volume.name).await?;
+        let record = self.tile_record(entry, &origin.tile, origin.position, read);
+        let mut commit = catalog.begin(&entry.volume.name).await?;
+        commit.detach(&origin.tile).await?;
+        let repair = match record {
+            Some(record) => {
+                let waiting = Waiting {
+                    position: origin.position,
+                    record,
+                    reason: reason.to_owned(),
+                };
+                commit.wait(&waiting).await?;
+                Repair::Queued
+            }
+            None => {
+                let what = Quarantined {
+                    file: RecordReader::FILE.to_owned(),
+                    tile: Some(origin.tile.clone()),
+                    reason: format!(
+                        "{reason}; append the tile's record to its acquisition once more, and ingest makes its own"
+                    ),
+                    bytes: Some(0),
+                    at: SystemTime::now(),
+                };
+                commit.quarantine(&what).await?;
+                Repair::Quarantined
+            }
+        };
+        commit.finish().await?;
+        Ok(repair)
+    }
+
     /// Gives a tile back to ingest, or puts it into quarantine.
     async fn repair(
         &self,
@@ -393,9 +531,20 @@ impl Check<'_> {
         tile: &Tile,
         reason: &str,
     ) -> Result<Repair, CheckError> {
-        let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
         let read = self.archive.catalog().cursor(&entry.volume.name).await?;
-        let repair = match self.record(entry, tile, read) {
+        let position = match position_of(&tile.pyramid) {
+            // One that had another's, and was given back.
+            None => {
+                let catalog = self.archive.catalog();
+                let origins = catalog.origins(&entry.volume.name, &tile.pyramid).await?;
+                let own = origins.iter().find(|origin| origin.tile == tile.name);
+                own.map(|origin| origin.position)
+            }
+            position => position,
+        };
+        let record = position.and_then(|at| self.tile_record(entry, &tile.name, at, read));
+        let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+        let repair = match position.zip(record) {
             Some((position, record)) => {
                 let reason = format!("its pyramid was found damaged: {reason}");
                 let waiting = Waiting {
@@ -425,25 +574,34 @@ impl Check<'_> {
         Ok(repair)
     }
 
-    /// The record that a tile's pyramid was made of, if it and its image are still there, and the records are
-    /// those that were `read`.
-    fn record(&self, entry: &VolumeEntry, tile: &Tile, read: Cursor) -> Option<(u64, TileRecord)> {
+    /// The record at a position, and the folder of its acquisition, if the records are those that were `read`.
+    fn record_at(&self, entry: &VolumeEntry, at: u64, read: Cursor) -> Option<(PathBuf, Record)> {
         let kept = { self.options.watched.iter() }.map(|all| all.join(&entry.volume.name));
         let mut kept = kept.filter(|folder| folder.join(RecordReader::FILE).is_file());
         let folder = kept.next().or_else(|| self.options.acquisition.clone())?;
-        let folder = folder.as_path();
-        RecordReader::new(folder, read).recognize().ok()?;
-        let offset = position_of(&tile.pyramid)?;
+        RecordReader::new(&folder, read).recognize().ok()?;
         let cursor = Cursor {
-            offset,
+            offset: at,
             ..Cursor::default()
         };
-        let mut reader = RecordReader::new(folder, cursor);
+        let mut reader = RecordReader::new(&folder, cursor);
         let line = reader.read(1).ok()?.into_iter().next()?;
-        match line.record {
-            Ok(Record::Tile(record)) if record.tile == tile.name && line.offset == offset => {
-                let image = image_path(folder, &record.file)?;
-                image.is_file().then_some((offset, record))
+        let record = line.record.ok().filter(|_| line.offset == at)?;
+        Some((folder, record))
+    }
+
+    /// A tile's record at a position, if its image is still there.
+    fn tile_record(
+        &self,
+        entry: &VolumeEntry,
+        tile: &str,
+        at: u64,
+        read: Cursor,
+    ) -> Option<TileRecord> {
+        match self.record_at(entry, at, read)? {
+            (folder, Record::Tile(record)) if record.tile == tile => {
+                let image = image_path(&folder, &record.file)?;
+                image.is_file().then_some(record)
             }
             _ => None,
         }
@@ -461,20 +619,20 @@ impl Check<'_> {
                 self.report.young += 1;
                 continue;
             }
-            let origin = self.origin(&object.name).await?;
-            let repair = if self.options.repair && origin == Origin::Read {
+            let origin = self.whence(&object.name).await?;
+            let repair = if self.options.repair && origin == Whence::Read {
                 self.archive.storage().delete(&object.name).await?;
                 Some(Repair::Deleted)
             } else {
                 None
             };
             let why = match origin {
-                Origin::Read => "",
-                Origin::Later => {
+                Whence::Read => "",
+                Whence::Later => {
                     ", which are of a record that the catalog has not read: if it is an older copy, `saccade ingest` goes on \
                      from there; they are never deleted"
                 }
-                Origin::Foreign => {
+                Whence::Foreign => {
                     ", and they are no pyramid of this catalog's; they are never deleted"
                 }
             };
@@ -493,7 +651,7 @@ impl Check<'_> {
 
 /// Where an object comes from that nothing names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Origin {
+enum Whence {
     /// A record that the catalog has read: what came of it is entered, or will never be.
     Read,
     /// One that it has not read.
@@ -503,18 +661,18 @@ enum Origin {
 }
 
 impl Check<'_> {
-    async fn origin(&self, object: &str) -> Result<Origin, CheckError> {
+    async fn whence(&self, object: &str) -> Result<Whence, CheckError> {
         let parts: Vec<&str> = object.split('/').collect();
         let ["tiles", volume, section, pyramid] = parts[..] else {
-            return Ok(Origin::Foreign);
+            return Ok(Whence::Foreign);
         };
         let (Some(position), Ok(_)) = (position_of(pyramid), section.parse::<u32>()) else {
-            return Ok(Origin::Foreign);
+            return Ok(Whence::Foreign);
         };
         match self.archive.catalog().cursor(volume).await {
-            Ok(read) if position < read.offset => Ok(Origin::Read),
-            Ok(_) => Ok(Origin::Later),
-            Err(CatalogError::UnknownVolume { .. }) => Ok(Origin::Foreign),
+            Ok(read) if position < read.offset => Ok(Whence::Read),
+            Ok(_) => Ok(Whence::Later),
+            Err(CatalogError::UnknownVolume { .. }) => Ok(Whence::Foreign),
             Err(error) => Err(error.into()),
         }
     }

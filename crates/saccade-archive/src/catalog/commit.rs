@@ -245,8 +245,8 @@ impl<'c> Commit<'c> {
         let (id, place) = (existing.id, existing.place);
         self.log_change(id, place, place, ChangeReason::Tile)
             .await?;
-        // No record's: those end with a position.
-        let none = format!("{}-none", existing.pyramid);
+        // No record's, for those end with a position; and no other tile's.
+        let none = format!("{}-none{}", existing.pyramid, id.0);
         let update = "UPDATE tiles SET pyramid = $2, revision = $3 WHERE id = $1";
         let values = [id.0.into(), (&none).into(), self.revision.into()];
         self.run(update, &values).await?;

@@ -6,7 +6,7 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Volume;
 
 use super::*;
-use crate::acquisition::{RecordWriter, TileRecord};
+use crate::acquisition::{RecordWriter, TileRecord, TransformRecord};
 use crate::catalog::NewTile;
 use crate::image::GrayImage;
 use crate::pyramid::{Encoding, encode};
@@ -88,6 +88,18 @@ impl Fixture {
 
     fn path(&self, n: usize) -> PathBuf {
         self.folder.path().join(&self.names[n])
+    }
+
+    /// Does what no program should to the catalog.
+    async fn meddle(&self, statements: &[&str]) {
+        let file = self.folder.path().join("catalog.sqlite");
+        let meddle = sqlx::SqlitePool::connect(file.to_str().unwrap()).await;
+        let meddle = meddle.unwrap();
+        for statement in statements {
+            let statement = sqlx::AssertSqlSafe((*statement).to_owned());
+            sqlx::query(statement).execute(&meddle).await.unwrap();
+        }
+        meddle.close().await;
     }
 
     async fn check(&self, quick: bool) -> CheckReport {
@@ -401,17 +413,120 @@ async fn what_is_kept_of_a_bare_folder_is_found() {
 }
 
 #[tokio::test]
+async fn tiles_outside_of_the_volume_are_moved_to_where_their_records_say() {
+    let fixture = Fixture::new().await;
+    let moved = SectionFromTile::translation(DVec2::new(40.0, 7.0));
+    let list = fixture.acquisition.path().join(RecordReader::FILE);
+    let position = fs::metadata(list).unwrap().len();
+    let mut writer = RecordWriter::open(fixture.acquisition.path()).unwrap();
+    let record = TransformRecord {
+        tile: "t2".to_owned(),
+        transform: moved,
+    };
+    writer.append(&Record::Transform(record)).unwrap();
+    let catalog = fixture.archive.catalog();
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit.transform("t2", moved, Some(position)).await.unwrap();
+    commit.finish().await.unwrap();
+    fixture
+        .meddle(&["UPDATE tiles SET tx = 1e6 WHERE name IN ('t2', 't3')"])
+        .await;
+    let of = |n: u32| (FindingKind::Misplaced, format!("t{n}"));
+    // Without the records nothing is known, and what to do is told.
+    let mut options = CheckOptions {
+        repair: true,
+        ..CheckOptions::default()
+    };
+    let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+    let found: Vec<_> = { report.findings.iter() }
+        .map(|f| ((f.kind, f.tile.clone().unwrap()), f.repair))
+        .collect();
+    assert_eq!(found, [(of(2), None), (of(3), None)]);
+    let reason = &report.findings[0].reason;
+    assert!(
+        reason.contains("--acquisition") && reason.contains("saccade update"),
+        "{reason}"
+    );
+    assert_eq!(report.damage(), 2);
+
+    options.acquisition = Some(fixture.acquisition.path().to_owned());
+    let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+    let repairs: Vec<_> = report.findings.iter().map(|f| f.repair).collect();
+    assert_eq!(
+        (repairs, report.damage()),
+        (vec![Some(Repair::Moved); 2], 0)
+    );
+    let of = async |name: &str| catalog.tile(VOLUME, name).await.unwrap().unwrap().transform;
+    assert_eq!(of("t2").await, moved);
+    assert_eq!(of("t3").await, of("t4").await);
+    assert_eq!(fixture.check(false).await.findings, []);
+}
+
+#[tokio::test]
+async fn who_names_anothers_pyramid_gets_one_of_its_own() {
+    // Of those that share it, the owner is the first or the last that is met; or it is nobody's.
+    for (owner, others) in [(0, [3, 5]), (4, [1, 2])] {
+        let fixture = Fixture::new().await;
+        let share = |n: u32| {
+            format!(
+                "UPDATE tiles SET pyramid = '{}' WHERE name = 't{n}'",
+                fixture.names[owner]
+            )
+        };
+        fixture
+            .meddle(&others.map(share).each_ref().map(String::as_str))
+            .await;
+        let report = fixture.check(false).await;
+        let want = others.map(|n| (FindingKind::Shared, format!("t{n}")));
+        let found: Vec<_> = { report.findings.iter() }
+            .filter(|f| f.kind != FindingKind::Orphan)
+            .map(|f| (f.kind, f.tile.clone().unwrap()))
+            .collect();
+        assert_eq!(found, want);
+        assert!(
+            report.findings[0]
+                .reason
+                .contains(&format!("of tile t{owner}"))
+        );
+        let options = CheckOptions {
+            repair: true,
+            acquisition: Some(fixture.acquisition.path().to_owned()),
+            ..CheckOptions::default()
+        };
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let repairs: Vec<_> = report.findings.iter().map(|f| f.repair).collect();
+        assert_eq!(
+            (repairs, report.damage()),
+            (vec![Some(Repair::Queued); 2], 0)
+        );
+        let catalog = fixture.archive.catalog();
+        let waiting = catalog.waiting(VOLUME).await.unwrap().into_iter();
+        let waiting: Vec<_> = waiting.map(|w| w.record.tile).collect();
+        assert_eq!(waiting, others.map(|n| format!("t{n}")));
+        // Who looks before they are made anew finds them missing, and on their way.
+        let again = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let again: Vec<_> = again.findings.iter().map(|f| (f.kind, f.repair)).collect();
+        assert_eq!(again, [(FindingKind::Missing, Some(Repair::Queued)); 2]);
+        assert_eq!(catalog.waiting(VOLUME).await.unwrap().len(), 2);
+        // What was the owner's is so still, and nobody else's.
+        let origins = catalog
+            .origins(VOLUME, &fixture.names[owner])
+            .await
+            .unwrap();
+        assert_eq!(origins.len(), 1);
+        assert_eq!(origins[0].tile, format!("t{owner}"));
+    }
+}
+
+#[tokio::test]
 async fn wrong_counts_are_made_right() {
     let fixture = Fixture::new().await;
-    let file = fixture.folder.path().join("catalog.sqlite");
-    let meddle = sqlx::SqlitePool::connect(file.to_str().unwrap()).await;
-    let meddle = meddle.unwrap();
-    for statement in [
-        "UPDATE volumes SET tiles = 99",
-        "DELETE FROM sections WHERE section = 1",
-    ] {
-        sqlx::query(statement).execute(&meddle).await.unwrap();
-    }
+    fixture
+        .meddle(&[
+            "UPDATE volumes SET tiles = 99",
+            "DELETE FROM sections WHERE section = 1",
+        ])
+        .await;
     let mut options = CheckOptions::default();
     let catalog = fixture.archive.catalog();
     for (repair, expected) in [(false, None), (true, Some(Repair::Recounted))] {

@@ -27,8 +27,9 @@ pub(crate) struct Check {
     #[arg(long)]
     quick: bool,
 
-    /// Delete pyramids that nothing has named for an hour; give damaged tiles back to `saccade
-    /// ingest`, or set them aside if --acquisition does not help [default: change nothing]
+    /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume to where their
+    /// records say; give tiles that are damaged, or name another's pyramid, back to `saccade ingest`, or set them aside
+    /// if --acquisition does not help [default: change nothing]
     #[arg(long)]
     repair: bool,
 
@@ -107,6 +108,7 @@ fn line(finding: &Finding) -> String {
     line.push_str(match finding.repair {
         Some(Repair::Deleted) => "; deleted",
         Some(Repair::Recounted) => "; counted anew",
+        Some(Repair::Moved) => "; moved to where its records say",
         Some(Repair::Queued) => "; `saccade ingest` makes it anew",
         Some(Repair::Quarantined) => "; set aside: append its record once more",
         _ => "",
