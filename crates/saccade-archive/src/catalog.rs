@@ -33,6 +33,7 @@ mod error;
 mod holders;
 mod identity;
 mod location;
+mod origins;
 mod postgres;
 mod rows;
 mod sqlite;
@@ -58,6 +59,7 @@ pub use clock::{Clock, SystemClock};
 pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
 pub use error::CatalogError;
 pub use location::CatalogLocation;
+pub use origins::Origin;
 pub use workers::{Claim, HeldUp, Worker};
 
 /// Most changes that [`Catalog::changes_after`] returns at once.
@@ -171,17 +173,6 @@ pub struct Retired {
     pub pyramid: String,
     /// Since when.
     pub at: SystemTime,
-}
-
-/// Which records say what a tile is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Origin {
-    /// The tile's name.
-    pub tile: String,
-    /// Position of the record that brought its image.
-    pub position: u64,
-    /// Position of the record that brought its transform.
-    pub transform_position: u64,
 }
 
 /// A volume and how far it is.
@@ -693,19 +684,6 @@ impl Catalog {
         let question = "SELECT DISTINCT section FROM tiles WHERE volume = $1 AND deleted = 0 \
                         ORDER BY section";
         self.ask(question, &[id.into()], rows::section).await
-    }
-
-    /// The tiles that name a pyramid, by their ids. Looks at all tiles of the volume.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn origins(&self, volume: &str, pyramid: &str) -> Result<Vec<Origin>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT name, position, transform_position FROM tiles \
-                        WHERE volume = $1 AND pyramid = $2 AND deleted = 0 ORDER BY id";
-        let values = [id.into(), pyramid.into()];
-        self.ask(question, &values, rows::origin).await
     }
 
     /// Counts a volume's tiles anew, in all and by section.
