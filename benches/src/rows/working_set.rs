@@ -193,8 +193,9 @@ mod tests {
             let mut hit = 0;
             for (at, count) in (0..).zip(&counts) {
                 let pixel = UVec2::new(at % 37, at / 37).as_dvec2() + 0.5;
-                let ray = camera.ray(pixel, view.size.as_dvec2()).normalize();
-                let mut met = std::collections::HashSet::new();
+                let ray = camera.ray(pixel, view.size.as_dvec2());
+                let ray = ray.try_normalize().unwrap();
+                let mut met = HashSet::new();
                 let reach = camera.distance_nm + volume.size_nm().length();
                 let mut depth = 0.0;
                 while depth < reach {
