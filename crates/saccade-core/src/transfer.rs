@@ -15,6 +15,7 @@ pub const TABLE_LEN: usize = 256;
 
 /// A corner of the piecewise linear opacity.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct OpacityPoint {
     /// Voxel value, `[0, 1]` of the value type's range.
     pub value: f32,
@@ -24,6 +25,7 @@ pub struct OpacityPoint {
 
 /// How values become light: colour from a map, opacity from a polyline.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct TransferFunction {
     /// Which end of the values is to be seen.
     pub polarity: Polarity,

@@ -60,7 +60,7 @@ pub use options::{
     host_memory_from_text,
 };
 pub use page::{PageError, PageOptions};
-pub use plane::{Plane, plane_from_text};
+pub use plane::{Plane, plane_from_text, slice_from_text};
 pub use shown::{
     MOST_CUTS, OutsideError, Shown, ShownError, box_from_text, channels_from_text,
     false_colors_from_text, heat_from_text, isos_from_text, mode_from_text, thickness_from_text,

@@ -349,7 +349,7 @@ mod tests {
             }
         }
         let outside = Shown {
-            slice: Some(crate::plane::Plane::across(2, 70.0)),
+            slice: Some(crate::plane::Plane::through_voxel(2, 70.0)),
             ..Shown::default()
         };
         let told = check(ViewOptions {

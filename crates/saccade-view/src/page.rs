@@ -7,7 +7,7 @@ use crate::detail::details_from_text;
 use crate::options::{
     BackgroundError, ViewOptions, background_from_text, gpu_memory_from_text, host_memory_from_text,
 };
-use crate::plane::plane_from_text;
+use crate::plane::{plane_from_text, slice_from_text};
 use crate::shown::{
     MOST_CUTS, ShownError, box_from_text, channels_from_text, false_colors_from_text,
     heat_from_text, isos_from_text, mode_from_text, thickness_from_text,
@@ -94,7 +94,7 @@ impl PageOptions {
                 "iso" => page.view.isos = isos_from_text(&value)?,
                 "clip" => page.view.shown.within = Some(box_from_text(&value)?),
                 "detail" => page.view.details = details_from_text(&value)?,
-                "slice" => page.view.shown.slice = Some(plane_from_text(&value)?),
+                "slice" => page.view.shown.slice = Some(slice_from_text(&value)?),
                 "slab" => page.view.shown.slab_nm = thickness_from_text(&value)?,
                 "cut" => {
                     let fits = page.view.shown.cut(plane_from_text(&value)?);
@@ -217,7 +217,7 @@ mod tests {
             crate::shown::Shown {
                 mode: saccade_render::Mode::IsoSurface,
                 within: Some(clip),
-                slice: Some(Plane::across(0, 3.0)),
+                slice: Some(Plane::across(0, 3.5)),
                 slab_nm: 80.0,
                 cuts: [Some(oblique), Some(Plane::across(2, 2.0)), None, None],
                 heat: Some(saccade_render::Heat {

@@ -266,7 +266,8 @@ fn slice(ui: &mut Ui, shown: &mut Shown, volume: &Volume, camera: &Camera) {
                 .selectable_label(axis == Some(Some(index)), name)
                 .clicked()
             {
-                shown.slice = Some(Plane::across(index, extent[index] / 2.0));
+                let middle = (extent[index] / 2.0).floor();
+                shown.slice = Some(Plane::through_voxel(index, middle));
             }
         }
         let oblique = ui.selectable_label(axis == Some(None), "oblique");
@@ -281,12 +282,12 @@ fn slice(ui: &mut Ui, shown: &mut Shown, volume: &Volume, camera: &Camera) {
         return;
     };
     match plane.axis() {
-        Some((axis, mut at)) => {
-            if ui
-                .add(Slider::new(&mut at, 0.0..=extent[axis]).text("voxel"))
-                .changed()
-            {
-                *plane = Plane::across(axis, at);
+        Some((axis, at)) => {
+            let (mut voxel, last) = (at - 0.5, extent[axis] - 1.0);
+            let slider = Slider::new(&mut voxel, 0.0..=last).step_by(1.0);
+            let slider = slider.clamping(SliderClamping::Edits).text("voxel");
+            if ui.add(slider).changed() {
+                *plane = Plane::through_voxel(axis, voxel);
             }
         }
         None => along_normal(ui, plane, volume, "nm from the middle"),

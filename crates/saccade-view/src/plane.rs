@@ -27,6 +27,12 @@ impl Plane {
         Self { normal, point }
     }
 
+    /// Across an axis, through the middle of a voxel, so that nothing of its neighbours is seen \[number of the voxel at
+    /// level 0\].
+    pub fn through_voxel(axis: usize, voxel: f64) -> Self {
+        Self::across(axis, voxel + 0.5)
+    }
+
     /// The axis that it is across, and where along it \[level-0 voxels\]; none if it is oblique.
     pub fn axis(&self) -> Option<(usize, f64)> {
         let axis = DVec3::AXES.iter().position(|axis| *axis == self.normal)?;
@@ -82,14 +88,29 @@ impl Plane {
     }
 }
 
-/// A plane: across an axis, as in `z=40`, or with any normal and through any point, as in
-/// `1,0.5,0@300,200,40` \[the normal in nanometres' directions, the point in level-0 voxels\].
+/// A plane to cut along: across an axis, as in `z=40`, which lies between voxels 39 and 40, or with any normal and through any
+/// point, as in `1,0.5,0@300,200,40` \[the normal in nanometres' directions, the point in level-0 voxels from the volume's corner\].
 ///
 /// # Errors
 ///
 /// [`ShownError`] on anything else.
 pub fn plane_from_text(text: &str) -> Result<Plane, ShownError> {
-    across(text).or_else(|| oblique(text)).map_or_else(
+    plane(text, Plane::across)
+}
+
+/// A plane to look at: across an axis through the middle of a voxel, as in `z=40`, which is section 40, or as
+/// [`plane_from_text`] has it.
+///
+/// # Errors
+///
+/// [`ShownError`] on anything else.
+pub fn slice_from_text(text: &str) -> Result<Plane, ShownError> {
+    plane(text, Plane::through_voxel)
+}
+
+fn plane(text: &str, at: impl Fn(usize, f64) -> Plane) -> Result<Plane, ShownError> {
+    let across = across(text).map(|(axis, place)| at(axis, place));
+    across.or_else(|| oblique(text)).map_or_else(
         || {
             ShownError::of(
                 text,
@@ -102,11 +123,11 @@ pub fn plane_from_text(text: &str) -> Result<Plane, ShownError> {
     )
 }
 
-fn across(text: &str) -> Option<Plane> {
+fn across(text: &str) -> Option<(usize, f64)> {
     let (axis, at) = text.split_once('=')?;
     let axis = AXES.iter().position(|name| *name == axis.trim())?;
     let at: f64 = at.trim().parse().ok()?;
-    at.is_finite().then(|| Plane::across(axis, at))
+    at.is_finite().then_some((axis, at))
 }
 
 fn oblique(text: &str) -> Option<Plane> {
@@ -144,6 +165,9 @@ mod tests {
         };
         assert_eq!(plane_from_text("1,-0.5,0@3, 2,1.5"), Ok(oblique));
         assert_eq!(oblique.axis(), None);
+        // Cuts lie between voxels, what is looked at in the middle of one.
+        assert_eq!(slice_from_text("z=40"), Ok(Plane::across(2, 40.5)));
+        assert_eq!(slice_from_text("1,-0.5,0@3,2,1.5"), Ok(oblique));
         let along = plane_from_text("0,0,8@3,2,1.5").unwrap();
         assert_eq!(along.axis(), Some((2, 1.5)), "across an axis");
         for bad in [

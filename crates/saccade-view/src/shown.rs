@@ -211,7 +211,7 @@ pub enum OutsideError {
     Slice {
         /// x, y or z.
         axis: &'static str,
-        /// As given \[level-0 voxels\].
+        /// Number of the voxel at level 0, as given.
         at: f64,
         /// The last voxel there is.
         last: u32,
@@ -261,6 +261,8 @@ impl Shown {
                     let (from, to) = (at - half, at + half);
                     let end = f64::from(extent[axis]);
                     if !(from < end && to >= 0.0) {
+                        // As it was given.
+                        let at = at - 0.5;
                         let last = extent[axis].saturating_sub(1);
                         let axis = AXES[axis];
                         return Err(OutsideError::Slice { axis, at, last });
@@ -327,7 +329,7 @@ mod tests {
     use glam::UVec3;
 
     use super::*;
-    use crate::plane::plane_from_text;
+    use crate::plane::slice_from_text;
 
     #[test]
     fn text_names_what_is_shown() {
@@ -382,16 +384,16 @@ mod tests {
         let volume = Volume::new("v", UVec3::new(90, 80, 70), DVec3::ONE).unwrap();
         let check = |slice: Option<&str>, within: Option<&str>| {
             let shown = Shown {
-                slice: slice.map(|text| plane_from_text(text).unwrap()),
+                slice: slice.map(|text| slice_from_text(text).unwrap()),
                 within: within.map(|text| box_from_text(text).unwrap()),
                 ..Shown::default()
             };
             shown.check(&volume).map_err(|error| error.to_string())
         };
-        for good in ["z=0", "z=69", "z=69.9", "x=89", "y=3.5"] {
+        for good in ["z=0", "z=69", "z=69.4", "x=89", "y=3.5"] {
             assert_eq!(check(Some(good), None), Ok(()), "{good}");
         }
-        for bad in ["z=70", "z=-0.1", "x=9999", "y=80"] {
+        for bad in ["z=70", "z=-0.6", "x=9999", "y=80"] {
             assert!(check(Some(bad), None).is_err(), "{bad}");
         }
         let told = check(Some("z=9999"), None).unwrap_err();

@@ -116,6 +116,20 @@ mod tests {
         let mixed = r#"[{"value": 0.9, "opacity": 1}, {"value": 0.1, "opacity": 0}]"#;
         let beyond = r#"[{"value": 0.1, "opacity": 1.5}]"#;
         assert!(with("[0, 1]", "9", points).is_ok());
+        let misspelt = with(r#"[0, 1], "opacty": 3"#, "9", points);
+        assert!(
+            matches!(misspelt, Err(TransferError::Json { .. })),
+            "{misspelt:?}"
+        );
+        let misspelt = with(
+            "[0, 1]",
+            "9",
+            r#"[{"value": 0.1, "opacity": 1, "vlaue": 2}]"#,
+        );
+        assert!(
+            matches!(misspelt, Err(TransferError::Json { .. })),
+            "{misspelt:?}"
+        );
         assert!(matches!(
             with("[1, 1]", "9", points),
             Err(TransferError::Window { .. })

@@ -12,7 +12,7 @@ use saccade_view::{
     MOST_CUTS, Plane, Shown, ShownError, ViewOptions, background_from_text, box_from_text,
     channel_of_text, channels_from_text, details_from_text, false_colors_from_text,
     gpu_memory_from_text, heat_from_text, host_memory_from_text, isos_from_text, mode_from_text,
-    plane_from_text, thickness_from_text, transfer_from_text,
+    plane_from_text, slice_from_text, thickness_from_text, transfer_from_text,
 };
 
 /// How finely channels are drawn, in one argument.
@@ -66,17 +66,17 @@ pub(crate) struct Looks {
     #[arg(long, value_name = "X,Y,Z,X,Y,Z", value_parser = box_from_text, allow_hyphen_values = true)]
     clip: Option<[DVec3; 2]>,
 
-    /// Show one plane: across an axis, as in z=40, or with any normal and through any point, as in
-    /// 1,0.5,0@300,200,40 [voxels of the finest level; normals in nm] [default: all depths]
-    #[arg(long, value_name = "PLANE", value_parser = plane_from_text, allow_hyphen_values = true)]
+    /// Show one plane: across an axis through the middle of a voxel, as in z=40, or with any normal and through
+    /// any point, as in 1,0.5,0@300,200,40 [voxels of the finest level; normals in nm] [default: all depths]
+    #[arg(long, value_name = "PLANE", value_parser = slice_from_text, allow_hyphen_values = true)]
     slice: Option<Plane>,
 
     /// With --slice, show what is around the plane as well, so thick in all [nm]; 0 is the plane alone
     #[arg(long, value_name = "NM", value_parser = thickness_from_text, default_value = "0", requires = "slice")]
     slab: f64,
 
-    /// Cut away what the normal of a plane does not point to; planes as with --slice, up to four times
-    /// [default: nothing]
+    /// Cut away what the normal of a plane does not point to; planes as with --slice, but z=40 lies before voxel 40;
+    /// up to four times [default: nothing]
     #[arg(long, value_name = "PLANE", value_parser = plane_from_text, allow_hyphen_values = true)]
     cut: Vec<Plane>,
 
@@ -109,7 +109,8 @@ pub(crate) struct Looks {
     #[arg(
         long,
         value_name = "LEVELS",
-        default_value_t = 0.0,
+        value_parser = lod_bias_from_text,
+        default_value = "0",
         allow_hyphen_values = true
     )]
     lod_bias: f32,
@@ -140,6 +141,16 @@ impl Looks {
                 "{MOST_CUTS} planes can cut at once; give --cut fewer times"
             );
         }
+        for (n, text) in self.transfer.iter().enumerate() {
+            let (channel, _) = channel_of_text(text);
+            let before = self.transfer[..n].iter();
+            let twice = { before }.any(|before| channel_of_text(before).0 == channel);
+            let whose = channel.map_or("the first channel".to_owned(), |n| format!("channel {n}"));
+            ensure!(
+                !twice,
+                "--transfer is given twice for {whose}; give it once for each"
+            );
+        }
         let transfers = self.transfer.iter().map(|text| transfer(text));
         let Details(details) = self.detail;
         Ok(ViewOptions {
@@ -162,6 +173,12 @@ impl Looks {
     }
 }
 
+fn lod_bias_from_text(text: &str) -> Result<f32, String> {
+    let bias = text.trim().parse().ok();
+    bias.filter(|bias: &f32| !bias.is_nan())
+        .ok_or_else(|| "a number of levels, as in 1 or -0.5".to_owned())
+}
+
 /// Of a channel, or of the first that is seen; `None` follows the data.
 fn transfer(text: &str) -> Result<(Option<u32>, Option<TransferFunction>)> {
     let (channel, text) = channel_of_text(text);
@@ -171,6 +188,10 @@ fn transfer(text: &str) -> Result<(Option<u32>, Option<TransferFunction>)> {
     let (json, place) = match text.starts_with('{') {
         true => (text.to_owned(), "--transfer"),
         false => {
+            ensure!(
+                !text.is_empty(),
+                "--transfer names no file; give auto, a JSON file, or JSON itself"
+            );
             let json = std::fs::read_to_string(text);
             let json = json.with_context(|| format!("cannot read the transfer function {text}"))?;
             (json, text)

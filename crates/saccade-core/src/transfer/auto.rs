@@ -144,7 +144,14 @@ impl Histogram {
         } else {
             [0.005, 0.995].map(|p| unit(self.percentile(p)))
         };
-        let high = high.max(low + 2.0 * step);
+        // Where all values are one, as in masks, that one is what is to be seen, and not the least of many.
+        let one = self.total() > 0 && low == high;
+        let low = if one { 0.0 } else { low };
+        let high = if one {
+            high
+        } else {
+            high.max(low + 2.0 * step)
+        };
         let point = |value, opacity| OpacityPoint { value, opacity };
         let (longest, shortest) = (size_nm.max_element(), size_nm.min_element());
         let (opacity, opacity_length_nm) = match polarity {
@@ -155,7 +162,8 @@ impl Histogram {
                 (points, (longest / 128.0).min(shortest / 4.0))
             }
             Polarity::Bright => {
-                let from = unit(self.percentile(0.60)).min(high - 1.5 * step).max(low);
+                let background = unit(self.percentile(0.60)).min(high - 1.5 * step);
+                let from = if one { high / 2.0 } else { background.max(low) };
                 let points = vec![point(from, 0.0), point(high, 0.85)];
                 (points, (longest / 64.0).min(shortest / 2.0))
             }
@@ -207,6 +215,38 @@ mod tests {
         let tf = bell(30.0, 10.0, 160.0).transfer_function(DVec3::new(4e5, 2e5, 600.0));
         let slab = super::super::opacity_of_length(0.8, 600.0, tf.opacity_length_nm);
         assert!(slab > 0.9, "three sections across show only {slab}");
+    }
+
+    /// A mask is as bright as can be, whatever its value, also where a few voxels have another.
+    #[test]
+    fn a_mask_is_seen() {
+        for (dtype, value) in [
+            (Dtype::Uint8, 1_u16),
+            (Dtype::Uint8, 128),
+            (Dtype::Uint8, 255),
+            (Dtype::Uint16, 1),
+            (Dtype::Uint16, 30_000),
+            (Dtype::Uint16, u16::MAX),
+        ] {
+            let mut mask = Histogram::new(dtype);
+            mask.counts[usize::from(value)] = 10_000;
+            if value < mask.largest() {
+                mask.counts[usize::from(value) + 1] = 3;
+            }
+            let seen = f32::from(value) / f32::from(mask.largest());
+            for tf in [
+                mask.transfer_function(DVec3::splat(1000.0)),
+                mask.transfer_function_of(Polarity::Bright, DVec3::splat(1000.0)),
+            ] {
+                assert_eq!((tf.polarity, tf.window), (Polarity::Bright, [0.0, seen]));
+                assert!(tf.opacity_at(seen) > 0.8, "{dtype:?} {value}: {tf:?}");
+                assert!(
+                    tf.opacity_at(seen / 3.0) < 0.01,
+                    "{dtype:?} {value}: {tf:?}"
+                );
+                assert!(tf.color_at(seen)[0] > 0.99, "{dtype:?} {value}: {tf:?}");
+            }
+        }
     }
 
     /// Twelve bits in sixteen look as the same values in eight do.

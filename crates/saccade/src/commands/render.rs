@@ -130,8 +130,8 @@ fn fidelity(status: &Status, empty: bool) -> String {
         ),
         _ => String::new(),
     };
-    if empty {
-        // Complete it is, but so is every picture of nothing.
+    if empty && status.complete {
+        // So is every picture of nothing.
         "nothing was acquired yet: the picture is empty".to_owned()
     } else if status.complete {
         format!("complete, {level}{revision}{full}")

@@ -269,7 +269,13 @@ fn a_window_without_a_display() {
             &["--transfer", "0:{}"],
             &["no transfer function", "--transfer"],
         ),
+        (&["--transfer", "0:"], &["--transfer names no file"]),
+        (
+            &["--transfer", "0:auto", "--transfer", "0:auto"],
+            &["twice for channel 0"],
+        ),
     ] {
         assert_failed(&view(more), 1, parts);
     }
+    assert_failed(&view(&["--lod-bias", "nan"]), 2, &["number of levels"]);
 }
