@@ -9,6 +9,7 @@ Every cell (`# %%`) can be run by itself in an editor that knows them, or be pas
 # %% Which volumes are there, and what is in them?
 import json
 import sys
+import time
 import urllib.request
 from urllib.parse import quote
 
@@ -53,11 +54,16 @@ print(f"the middle: {region.shape} voxels, {(before != 0).mean():.0%} acquired, 
 
 # %% Wait for the next change, and look again
 request = urllib.request.Request(f"{server}/{path}/events", headers={"Last-Event-ID": str(described["revision"])})
+change, until = None, time.monotonic() + 60
 with urllib.request.urlopen(request, timeout=60) as events:
-    for line in events:
+    for line in events:  # one that says nothing now and then, too, as long as there is no change
         if line.startswith(b"data:"):
             change = json.loads(line[5:])
+        if change or time.monotonic() > until:
             break
 after = region.read().result()
-print(f"revision {change['revision']}: {change['reason']} at {change['voxels']['min']}; "
-      f"{np.count_nonzero(after != before)} voxels of the middle differ")
+if change:
+    print(f"revision {change['revision']}: {change['reason']} at {change['voxels']['min']}; "
+          f"{np.count_nonzero(after != before)} voxels of the middle differ")
+else:
+    print("nothing has changed for a minute")

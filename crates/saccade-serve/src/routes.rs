@@ -6,6 +6,7 @@ use std::ops::Deref;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::extract::rejection::PathRejection;
 use axum::extract::{ConnectInfo, Path, Request, State};
 use axum::http::header::{
     ACCEPT_RANGES, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_RANGE, ETAG, HeaderMap,
@@ -199,7 +200,7 @@ fn described(value: impl serde::Serialize) -> Response {
 }
 
 /// The volumes on offer.
-#[utoipa::path(get, path = "/volumes.json", responses((status = 200, body = VolumeList)))]
+#[utoipa::path(get, tag = "volumes", path = "/volumes.json", responses((status = 200, body = VolumeList)))]
 pub(crate) async fn volumes(State(app): State<App>) -> Response {
     let entry = |published: &Arc<Published>| VolumeEntry {
         name: published.volume().name.clone(),
@@ -215,6 +216,7 @@ pub(crate) async fn volumes(State(app): State<App>) -> Response {
 /// What a volume is, and which state of it is offered now.
 #[utoipa::path(
     get,
+    tag = "volumes",
     path = "/v/{name}/volume.json",
     params(("name" = String, Path, description = "name of the volume")),
     responses(
@@ -240,6 +242,7 @@ pub(crate) async fn volume(State(app): State<App>, Path(name): Path<String>) -> 
 /// How the acquisition of a volume is coming along.
 #[utoipa::path(
     get,
+    tag = "volumes",
     path = "/v/{name}/status.json",
     params(("name" = String, Path, description = "name of the volume")),
     responses(
@@ -289,6 +292,7 @@ pub(crate) async fn status(State(app): State<App>, Path(name): Path<String>) -> 
 /// `Change` in JSON and whose id is its revision.
 #[utoipa::path(
     get,
+    tag = "volumes",
     path = "/v/{name}/events",
     params(
         ("name" = String, Path, description = "name of the volume"),
@@ -322,6 +326,7 @@ const MOST_CHANGES: usize = 16_384;
 /// What has changed after a revision, for clients that come back after longer than a stream of changes could be resumed.
 #[utoipa::path(
     get,
+    tag = "volumes",
     path = "/v/{name}/changes/{revision}",
     params(
         ("name" = String, Path, description = "name of the volume"),
@@ -329,14 +334,20 @@ const MOST_CHANGES: usize = 16_384;
     ),
     responses(
         (status = 200, body = ChangeList),
+        (status = 400, body = Refusal, description = "the revision is no number"),
         (status = 404, body = Refusal, description = "no such volume"),
         (status = 503, body = Refusal, description = "not known in time; ask again after Retry-After")
     )
 )]
 pub(crate) async fn changes_after(
     State(app): State<App>,
-    Path((name, revision)): Path<(String, u64)>,
+    path: Result<Path<(String, u64)>, PathRejection>,
 ) -> Response {
+    let Ok(Path((name, revision))) = path else {
+        return bad_request(
+            "the revision is to be a whole number, as volume.json has it".to_owned(),
+        );
+    };
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,
@@ -382,6 +393,7 @@ async fn list(State(app): State<App>, headers: HeaderMap) -> Response {
 /// A section near the middle, from afar.
 #[utoipa::path(
     get,
+    tag = "volumes",
     path = "/v/{name}/thumbnail.png",
     params(("name" = String, Path, description = "name of the volume")),
     responses(
@@ -457,6 +469,7 @@ const MOST_RANGES: usize = 256;
 /// such chunks, or too many.
 #[utoipa::path(
     get,
+    tag = "volumes",
     path = "/v/{name}/ranges/{channel}/{level}/{chunks}",
     params(
         ("name" = String, Path, description = "name of the volume"),
@@ -466,14 +479,17 @@ const MOST_RANGES: usize = 256;
     ),
     responses(
         (status = 200, body = RangeList),
-        (status = 400, body = Refusal, description = "the volume has not all of these chunks, or they are too many"),
+        (status = 400, body = Refusal, description = "the volume has not all of these chunks, they are too many, or a number is none"),
         (status = 404, body = Refusal, description = "no such volume")
     )
 )]
 pub(crate) async fn ranges(
     State(app): State<App>,
-    Path((name, channel, level, chunks)): Path<(String, u32, u32, String)>,
+    path: Result<Path<(String, u32, u32, String)>, PathRejection>,
 ) -> Response {
+    let Ok(Path((name, channel, level, chunks))) = path else {
+        return bad_request("channel and level are to be whole numbers".to_owned());
+    };
     let published = match find(&app, &name) {
         Ok(published) => published,
         Err(refusal) => return *refusal,

@@ -81,6 +81,32 @@ fn schema<'d>(document: &'d Value, path: &str, status: &str, media: &str) -> &'d
     &document["paths"][path]["get"]["responses"][status]["content"][media]["schema"]
 }
 
+/// Documented as well, and in words.
+#[test]
+fn numbers_that_are_none_are_refused() {
+    run(async {
+        let served = serve(Options::DEFAULT).await;
+        let document = served.json("openapi.json").await;
+        for (path, address) in [
+            ("/v/{name}/changes/{revision}", "v/em/changes/abc"),
+            ("/v/{name}/changes/{revision}", "v/em/changes/-1"),
+            (
+                "/v/{name}/ranges/{channel}/{level}/{chunks}",
+                "v/em/ranges/a/0/0,0,0",
+            ),
+        ] {
+            let answer = served.get(address).await;
+            assert_eq!(answer.status(), StatusCode::BAD_REQUEST, "{address}");
+            let words: serde_json::Value =
+                serde_json::from_slice(&answer.bytes().await.unwrap()).unwrap();
+            let error = words["error"].as_str().unwrap();
+            assert!(error.contains("whole number"), "{words}");
+            let responses = &document["paths"][path]["get"]["responses"];
+            assert!(responses["400"].is_object(), "{path}: {responses}");
+        }
+    });
+}
+
 #[test]
 fn answers_are_what_the_document_says() {
     run(async {
