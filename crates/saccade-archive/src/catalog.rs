@@ -238,6 +238,19 @@ struct Inner {
     changes_kept: AtomicU64,
 }
 
+impl Inner {
+    /// Why nothing can be read, if the file was taken away.
+    fn away(&self) -> Option<CatalogError> {
+        match &self.database {
+            Database::Sqlite(opened) => opened.away().map(|away| CatalogError::Away {
+                why: away.why,
+                location: self.location.clone(),
+            }),
+            Database::Postgres(_) => None,
+        }
+    }
+}
+
 impl Catalog {
     /// Opens a catalog that exists.
     ///
@@ -510,6 +523,25 @@ impl Catalog {
         Ok(receiver)
     }
 
+    /// Looks from now on whether the file is still the one of its name, see [`Self::times_replaced`].
+    ///
+    /// # Panics
+    ///
+    /// Outside of a Tokio runtime.
+    pub fn follow(&self) {
+        self.inner.watcher.follow(&self.inner);
+    }
+
+    /// How often another file has taken the place of the one that was open. From then on that is read, whose revisions count
+    /// anew, and anything may be another; nothing can be written any more. Looked for several times a second from
+    /// [`Self::follow`] or the first [`Self::subscribe`] on, whose receivers wake then.
+    pub fn times_replaced(&self) -> u64 {
+        match &self.inner.database {
+            Database::Sqlite(opened) => opened.times_replaced(),
+            Database::Postgres(_) => 0,
+        }
+    }
+
     /// Begins a transaction on a volume. Nothing is changed until [`Commit::finish`].
     ///
     /// # Errors
@@ -720,9 +752,12 @@ impl Catalog {
         values: &[Value<'_>],
         understand: impl Fn(&Row) -> Result<T, sqlx::Error>,
     ) -> Result<Vec<T>, CatalogError> {
+        if let Some(away) = self.inner.away() {
+            return Err(away);
+        }
         let rows = self.inner.database.all(question, values).await;
         let rows = rows.and_then(|rows| rows.iter().map(understand).collect());
-        rows.map_err(|e| self.failed(e))
+        rows.map_err(|e| self.inner.away().unwrap_or_else(|| self.failed(e)))
     }
 
     async fn transaction(&self, durability: Durability) -> Result<Transaction, CatalogError> {
@@ -747,9 +782,11 @@ impl Catalog {
     /// acknowledges is lost with it.
     fn look_for_file(&self) -> Result<(), CatalogError> {
         match &self.inner.database {
-            Database::Sqlite(opened) if opened.is_elsewhere() => Err(CatalogError::Moved {
-                location: self.location().clone(),
-            }),
+            Database::Sqlite(opened) if opened.is_elsewhere() || opened.times_replaced() > 0 => {
+                Err(CatalogError::Moved {
+                    location: self.location().clone(),
+                })
+            }
             Database::Sqlite(_) | Database::Postgres(_) => Ok(()),
         }
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use saccade_archive::VisualizationArchive;
-use saccade_archive::catalog::CatalogError;
+use saccade_archive::catalog::{CatalogError, VolumeEntry};
 use saccade_source::SourceError;
 use saccade_source::stitched::{StitchedOptions, StitchedSource};
 
@@ -23,6 +23,8 @@ pub struct Offer {
 }
 
 /// Offers the volumes of an archive that are not offered yet. One that cannot be opened keeps no other from being offered.
+/// Where another catalog took the place of the one that was open, volumes that are others in it are opened anew, and
+/// those that it does not have are offered no more.
 ///
 /// # Errors
 ///
@@ -32,8 +34,12 @@ pub async fn offer_archive(
     archive: &VisualizationArchive,
     options: StitchedOptions,
 ) -> Result<Offer, CatalogError> {
-    let offered = volumes.names();
+    archive.catalog().follow();
     let entries = archive.catalog().volumes().await?;
+    if archive.catalog().times_replaced() > 0 {
+        withdraw_others(volumes, &entries);
+    }
+    let offered = volumes.names();
     volumes.keep_failing(|name| entries.iter().any(|entry| entry.volume.name == name));
     let mut offer = Offer::default();
     for entry in entries {
@@ -59,6 +65,22 @@ pub async fn offer_archive(
     Ok(offer)
 }
 
+/// Offers no more what an archive has not, or has as another.
+fn withdraw_others(volumes: &Volumes, entries: &[VolumeEntry]) {
+    for offered in volumes.all() {
+        let volume = offered.volume();
+        let is_there = entries.iter().any(|entry| entry.volume == **volume);
+        // What is not made of tiles is of no archive.
+        if !is_there && offered.status.is_some() {
+            let name = &volume.name;
+            log::warn!(
+                "volume {name:?} is not in the catalog that is there now, or is another in it: it is offered no more"
+            );
+            volumes.withdraw(name);
+        }
+    }
+}
+
 /// Why a volume cannot be opened, as far as clients may know.
 fn told(error: &SourceError) -> String {
     match error {
@@ -75,13 +97,23 @@ pub async fn follow_archive(
     options: StitchedOptions,
     poll: Duration,
 ) {
+    let mut told = None;
     loop {
         tokio::time::sleep(poll).await;
         match offer_archive(volumes, archive, options.clone()).await {
-            Ok(Offer { new, .. }) => new
-                .iter()
-                .for_each(|name| log::info!("volume {name:?} is offered now")),
-            Err(error) => log::warn!("new volumes cannot be offered: {error}"),
+            Ok(Offer { new, .. }) => {
+                told = None;
+                for name in new {
+                    log::info!("volume {name:?} is offered now");
+                }
+            }
+            Err(error) => {
+                let error = error.to_string();
+                if told.as_ref() != Some(&error) {
+                    log::warn!("new volumes cannot be offered: {error}");
+                    told = Some(error);
+                }
+            }
         }
     }
 }

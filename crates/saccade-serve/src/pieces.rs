@@ -182,7 +182,10 @@ pub(crate) fn failed(published: &Published, error: &ChunkError) -> Response {
     match error {
         ChunkError::NotReady { retry_after, .. } => try_again(error.to_string(), *retry_after),
         other => {
-            log::warn!("volume {:?}: {}", published.volume().name, chain(other));
+            // Of chunks that one damaged tile is in, the first is told.
+            if published.is_to_tell_of(&why(other)) {
+                log::warn!("volume {:?}: {}", published.volume().name, chain(other));
+            }
             let after = other.is_transient().then_some(Duration::from_secs(1));
             let after = other.retry_after().or(after);
             let cause = match other {
@@ -194,13 +197,24 @@ pub(crate) fn failed(published: &Published, error: &ChunkError) -> Response {
     }
 }
 
-/// An error and its causes, on one line.
+/// What is behind an error, whatever chunk it was met in.
+fn why(error: &ChunkError) -> String {
+    match std::error::Error::source(error) {
+        Some(source) => chain(source),
+        None => error.to_string(),
+    }
+}
+
+/// An error and its causes, on one line, each said once: some libraries repeat their cause in their own message.
 pub(crate) fn chain(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(Some(error), |error| error.source());
-    causes
-        .map(ToString::to_string)
-        .collect::<Vec<_>>()
-        .join(": ")
+    let mut said: Vec<String> = Vec::new();
+    for cause in std::iter::successors(Some(error), |error| error.source()) {
+        let cause = cause.to_string();
+        if !said.iter().any(|before| before.contains(&cause)) {
+            said.push(cause);
+        }
+    }
+    said.join(": ")
 }
 
 #[cfg(test)]

@@ -54,6 +54,11 @@ impl Volumes {
         offered.published.insert(name, published);
     }
 
+    /// Offers a volume no more.
+    pub(crate) fn withdraw(&self, name: &str) {
+        self.write().published.remove(name);
+    }
+
     /// Lists a volume as one that cannot be offered now, and why. Whether that is news.
     pub(crate) fn fail(&self, name: &str, cause: String) -> bool {
         let mut offered = self.write();
@@ -111,6 +116,8 @@ pub(crate) struct Published {
     follower: JoinHandle<()>,
     /// When it was told last that a chunk takes long.
     told_of_late: Mutex<Option<Instant>>,
+    /// Why chunks could not be read, and when each was told last: one damaged tile is in many chunks.
+    told_of_failures: Mutex<BTreeMap<String, Instant>>,
     /// Reads that took too long for one answer.
     pub(crate) lingering: Lingering,
 }
@@ -150,6 +157,7 @@ impl Published {
             end,
             follower,
             told_of_late: Mutex::new(None),
+            told_of_failures: Mutex::default(),
             lingering: Lingering::default(),
         }
     }
@@ -162,6 +170,24 @@ impl Published {
             *told = Some(Instant::now());
         }
         is_due
+    }
+
+    /// Whether it should be told now that chunks cannot be read for this reason.
+    pub(crate) fn is_to_tell_of(&self, why: &str) -> bool {
+        /// Reasons that are remembered. Of more, some are told too often.
+        const MOST: usize = 1024;
+        let mut told = lock(&self.told_of_failures);
+        if told
+            .get(why)
+            .is_some_and(|told| told.elapsed() < TELL_AGAIN)
+        {
+            return false;
+        }
+        if told.len() >= MOST {
+            told.clear();
+        }
+        told.insert(why.to_owned(), Instant::now());
+        true
     }
 
     pub(crate) fn volume(&self) -> &Arc<Volume> {
@@ -252,8 +278,8 @@ impl Drop for Published {
 }
 
 /// A history is valid after every step: a panic elsewhere cannot have left it half-changed.
-fn lock(history: &Mutex<History>) -> MutexGuard<'_, History> {
-    history.lock().unwrap_or_else(PoisonError::into_inner)
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
@@ -272,5 +298,15 @@ mod tests {
         let before = Instant::now().checked_sub(TELL_AGAIN);
         *published.told_of_late.lock().unwrap() = before;
         assert!(published.is_to_tell_of_late());
+
+        // A damaged tile, of which many chunks have something.
+        for tile in ["a.tif is damaged", "b.tif is damaged"] {
+            let told = (0..100).filter(|_| published.is_to_tell_of(tile));
+            assert_eq!(told.count(), 1, "{tile}");
+        }
+        for n in 0..5000 {
+            assert!(published.is_to_tell_of(&n.to_string()));
+        }
+        assert!(published.told_of_failures.lock().unwrap().len() < 2000);
     }
 }

@@ -63,8 +63,8 @@ mod sampling;
 mod thumbnails;
 mod tiles;
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use glam::UVec2;
@@ -82,6 +82,7 @@ use crate::{Change, Chunk, ChunkError, ChunkId, Damage, SourceError, ValueRange,
 use block::{BlockGrid, CutChunk};
 use blocks::Blocks;
 use build::{Builder, Place, Rules};
+use follow::{Counted, Seen};
 use tiles::Tiles;
 
 pub use along_z::{AlongZ, Gaps};
@@ -202,6 +203,7 @@ struct Inner {
     disk: Option<(DiskCache, Vec<u8>)>,
     from_disk: AtomicU64,
     changes: Arc<Changes>,
+    counted: Mutex<Counted>,
     runtime: Handle,
 }
 
@@ -231,6 +233,7 @@ impl StitchedSource {
         };
         let failed = |source| open_error(StitchError::Catalog { source });
         // The watch exists before the revision is read, so that no change falls in between.
+        let replaced = catalog.times_replaced();
         let news = match catalog.subscribe(name).await {
             Err(CatalogError::UnknownVolume { .. }) => {
                 let volumes = catalog.volumes().await.map_err(failed)?;
@@ -270,10 +273,15 @@ impl StitchedSource {
             builder: Builder::new(volume.clone(), tiles, &options),
             builds: Arc::new(Semaphore::new(options.builds.max(1))),
             changes: Changes::new(VoxelBox::of_size(volume.extent()), entry.revision),
+            counted: Mutex::default(),
             runtime: Handle::current(),
             volume,
         });
-        let follow = follow::follow(Arc::downgrade(&inner), catalog, news, entry.revision);
+        let seen = Seen {
+            revision: entry.revision,
+            replaced,
+        };
+        let follow = follow::follow(Arc::downgrade(&inner), catalog, news, seen);
         let follower = tokio::spawn(follow).abort_handle();
         Ok(Self { inner, follower })
     }

@@ -128,7 +128,8 @@ impl Database {
         let question = question.into();
         match self {
             Self::Sqlite(opened) => {
-                let rows = query!(question.sqlite, values).fetch_all(&opened.readers);
+                let readers = opened.readers();
+                let rows = query!(question.sqlite, values).fetch_all(&readers);
                 Ok(rows.await?.into_iter().map(Row::Sqlite).collect())
             }
             Self::Postgres(pool) => {
@@ -147,7 +148,7 @@ impl Database {
 
     pub(super) fn is_closed(&self) -> bool {
         match self {
-            Self::Sqlite(opened) => opened.readers.is_closed(),
+            Self::Sqlite(opened) => opened.is_closed(),
             Self::Postgres(pool) => pool.is_closed(),
         }
     }

@@ -233,6 +233,18 @@ pub enum CatalogError {
         /// Where it was.
         location: CatalogLocation,
     },
+    /// The file that was being read is not the one of its name any more, and there is no other that could be read.
+    #[error(
+        "the catalog's file was moved, deleted or replaced while it was in use{}: put it back, or a copy of it, with the -wal \
+         that was beside it if there was one; it is read again as soon as it is there: {location}",
+        because(why.as_deref())
+    )]
+    Away {
+        /// Why what has its place cannot be read, if there is something.
+        why: Option<String>,
+        /// Where it was.
+        location: CatalogLocation,
+    },
     /// Anything else; see the source.
     #[error("the catalog could not be read or written: {location}")]
     Database {
@@ -279,7 +291,10 @@ impl CatalogError {
     /// server may come back.
     pub fn is_transient(&self) -> bool {
         match self {
-            Self::Full { .. } | Self::Unreachable { .. } | Self::Locked { .. } => true,
+            Self::Full { .. }
+            | Self::Unreachable { .. }
+            | Self::Locked { .. }
+            | Self::Away { .. } => true,
             // SQLITE_IOERR.
             Self::Database { source, location } => match location {
                 CatalogLocation::File(_) => {
@@ -318,6 +333,7 @@ impl CatalogError {
             | Self::Locked { location, .. }
             | Self::Damaged { location, .. }
             | Self::Moved { location }
+            | Self::Away { location, .. }
             | Self::Database { location, .. } => Some(location),
             Self::Missed { .. }
             | Self::UnknownVolume { .. }
@@ -413,6 +429,14 @@ fn by(holders: &[String]) -> String {
     match holders {
         [] => " by another program".to_owned(),
         known => format!(" by {}", known.join(" and ")),
+    }
+}
+
+/// Why what is there is of no use, behind "replaced".
+fn because(why: Option<&str>) -> String {
+    match why {
+        Some(why) => format!(", and what is there now cannot be read ({why})"),
+        None => String::new(),
     }
 }
 

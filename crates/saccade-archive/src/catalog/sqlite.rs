@@ -5,8 +5,8 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
-use std::sync::atomic::AtomicU32;
 use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicU32};
 use std::time::Duration;
 
 use sqlx::migrate::{MigrateError, Migrator};
@@ -14,6 +14,11 @@ use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, S
 use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
+
+mod replaced;
+
+use replaced::Replaced;
+pub(super) use replaced::{Away, Place};
 
 pub(super) static MIGRATOR: Migrator = sqlx::migrate!("migrations/sqlite");
 
@@ -61,7 +66,10 @@ pub(super) struct Opened {
     /// One connection, since SQLite lets one write at a time and waiting here costs no time-out;
     /// none if the file may only be read.
     pub(super) writer: Option<SqlitePool>,
-    pub(super) readers: SqlitePool,
+    readers: SqlitePool,
+    /// What took the place of the file since, for those who read.
+    replaced: Replaced,
+    closed: AtomicBool,
     /// Which file it was when it was opened; `None` if the system did not tell.
     id: Option<FileId>,
     /// Transactions in the write-ahead log, about.
@@ -81,6 +89,8 @@ impl Opened {
             id: FileId::of(path).ok(),
             writer,
             readers,
+            replaced: Replaced::default(),
+            closed: AtomicBool::new(false),
             // What is there from before is not known.
             logged: AtomicU32::new(MOST_LOGGED),
             stopped: OnceLock::new(),
@@ -118,6 +128,16 @@ impl Opened {
     }
 
     pub(super) async fn close(&self) {
+        self.closed.store(true, Relaxed);
+        self.close_connections().await;
+    }
+
+    pub(super) fn is_closed(&self) -> bool {
+        self.closed.load(Relaxed)
+    }
+
+    async fn close_connections(&self) {
+        self.readers().close().await;
         self.readers.close().await;
         if let Some(writer) = &self.writer {
             writer.close().await;
@@ -195,6 +215,19 @@ async fn connect(
             }
         }
     }
+}
+
+/// Opens for reading what has come to the place of a file that was open: what it holds is nobody's to change.
+async fn open_again(path: &Path) -> Result<Opened, CatalogError> {
+    refuse_foreign_file(path)?;
+    if is_write_protected(path) {
+        return open_to_read(path).await;
+    }
+    refuse_network(path)?;
+    let access = Access::Write;
+    let readers = open_readers(path, access).await?;
+    refuse_other_schema(&readers, path).await?;
+    Ok(Opened::new(path, access, None, readers))
 }
 
 /// Whether the file is there, but may not be changed: permissions, or a read-only file system.

@@ -6,10 +6,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
-use sqlx::{ConnectOptions, PgPool, SqliteConnection};
+use sqlx::{ConnectOptions, Connection as _, PgPool, SqliteConnection};
 use tokio::sync::watch;
 
 use super::database::Database;
+use super::sqlite::{Away, Place};
 use super::{Inner, postgres, rows, sqlite};
 
 /// How often to look for commits of other processes. Reading the counter costs some microseconds.
@@ -34,10 +35,15 @@ impl Watcher {
             .entry(volume.to_owned())
             .or_default()
             .subscribe();
+        self.follow(catalog);
+        receiver
+    }
+
+    /// Looks and listens from now on, until the catalog is closed.
+    pub(super) fn follow(&self, catalog: &Arc<Inner>) {
         if !self.following.swap(true, Ordering::AcqRel) {
             tokio::spawn(follow(Following(Arc::downgrade(catalog))));
         }
-        receiver
     }
 
     /// Wakes the subscribers of a volume, if the revision is new to them.
@@ -48,6 +54,13 @@ impl Watcher {
                 *known = revision.max(*known);
                 newer
             });
+        }
+    }
+
+    /// Wakes all subscribers: revisions count anew.
+    fn begin_anew(&self) {
+        for sender in self.senders().values() {
+            sender.send_replace(0);
         }
     }
 
@@ -161,12 +174,14 @@ async fn poll(following: &Following) {
         let Database::Sqlite(file) = &catalog.database else {
             return;
         };
-        warn_of_writers(file, &mut warned);
-        match look(&catalog, file, &mut connection, &mut seen).await {
-            Ok(()) => {}
-            Err(e) => {
-                log::warn!("cannot look for changes: {e}: {}", catalog.location);
-                connection = None;
+        if is_in_place(&catalog, file, &mut connection).await {
+            warn_of_writers(file, &mut warned);
+            match look(&catalog, file, &mut connection, &mut seen).await {
+                Ok(()) => {}
+                Err(e) => {
+                    log::warn!("cannot look for changes: {e}: {}", catalog.location);
+                    connection = None;
+                }
             }
         }
         drop(catalog);
@@ -174,9 +189,51 @@ async fn poll(following: &Following) {
     }
 }
 
+/// Whether the file that is read still has its name; else nothing is read until one has, and another is opened anew.
+async fn is_in_place(
+    catalog: &Inner,
+    file: &sqlite::Opened,
+    connection: &mut Option<SqliteConnection>,
+) -> bool {
+    let (place, location) = (file.place(), &catalog.location);
+    let tell_away = |why| {
+        if file.set_away(Some(Away { why })) {
+            log::warn!("{}", catalog.away().expect("it was said just now"));
+        }
+        false
+    };
+    match place {
+        // Connections are closed where something else was there meanwhile that could not be opened.
+        Place::Same if !file.readers().is_closed() => {
+            if file.set_away(None) {
+                log::warn!("the catalog's file is there again: {location}");
+            }
+            true
+        }
+        Place::Nobody => tell_away(None),
+        Place::Same | Place::Another => {
+            if file.away().is_none() {
+                tell_away(None);
+            }
+            if let Some(connection) = connection.take() {
+                let _it_is_of_no_use_any_more = connection.close().await;
+            }
+            if let Err(error) = file.open_again().await {
+                return tell_away(Some(error.without_place()));
+            }
+            file.set_away(None);
+            log::warn!(
+                "another file has taken the catalog's place, and is read from now on: {location}"
+            );
+            catalog.watcher.begin_anew();
+            true
+        }
+    }
+}
+
 /// Says once that a file which nobody was writing when it was opened is being written now.
 fn warn_of_writers(file: &sqlite::Opened, warned: &mut bool) {
-    let unchanging = file.access == sqlite::Access::ReadUnchanging;
+    let unchanging = file.reading() == sqlite::Access::ReadUnchanging;
     if unchanging && !*warned && sqlite::log_of(&file.path).exists() {
         *warned = true;
         let path = file.path.display();
@@ -195,7 +252,11 @@ async fn look(
         None => {
             // The counter only has meaning within one connection.
             *seen = None;
-            connection.insert(sqlite::options(&file.path, file.access).connect().await?)
+            connection.insert(
+                sqlite::options(&file.path, file.reading())
+                    .connect()
+                    .await?,
+            )
         }
     };
     let version: i64 = sqlx::query_scalar("PRAGMA data_version")

@@ -1,6 +1,6 @@
 //! Follows the catalog.
 
-use std::sync::Weak;
+use std::sync::{MutexGuard, PoisonError, Weak};
 use std::time::Duration;
 
 use saccade_archive::catalog::{Catalog, CatalogError, ChangeReason};
@@ -13,23 +13,47 @@ use crate::Change;
 /// When the catalog cannot be read, it is tried again after this.
 const TRY_AGAIN: Duration = Duration::from_millis(500);
 
+/// Up to where the catalog was read.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Seen {
+    /// The newest revision.
+    pub(super) revision: u64,
+    /// How often the catalog's file had been replaced by then.
+    pub(super) replaced: u64,
+}
+
+/// How revisions are told. Those of a catalog that took another's place count anew, those that are told never go back.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Counted {
+    /// By how much what is told is more than what the catalog says.
+    ahead: u64,
+    /// The first revision that was told of this catalog.
+    from: u64,
+}
+
 /// Passes on changes until the source is dropped or the catalog closed.
 pub(super) async fn follow(
     inner: Weak<Inner>,
     catalog: Catalog,
     mut news: watch::Receiver<u64>,
-    mut seen: u64,
+    mut seen: Seen,
 ) {
+    let mut told = None;
     loop {
         news.borrow_and_update();
         match catch_up(&inner, &catalog, &mut seen).await {
             Ok(()) => {
+                told = None;
                 if news.changed().await.is_err() {
                     return;
                 }
             }
             Err(error) => {
-                log::warn!("changes cannot be read, trying again: {error}");
+                let error = error.to_string();
+                if told.as_ref() != Some(&error) {
+                    log::warn!("changes cannot be read, trying again: {error}");
+                    told = Some(error);
+                }
                 tokio::time::sleep(TRY_AGAIN).await;
             }
         }
@@ -42,18 +66,37 @@ pub(super) async fn follow(
 async fn catch_up(
     inner: &Weak<Inner>,
     catalog: &Catalog,
-    seen: &mut u64,
+    seen: &mut Seen,
 ) -> Result<(), CatalogError> {
     while let Some(name) = inner.upgrade().map(|inner| inner.volume.name.clone()) {
-        let changes = match catalog.changes_after(&name, *seen).await {
+        let replaced = catalog.times_replaced();
+        if replaced != seen.replaced {
+            let entry = catalog.entry(&name).await?;
+            let Some(inner) = inner.upgrade() else {
+                return Ok(());
+            };
+            if entry.volume != *inner.volume {
+                log::warn!(
+                    "volume {name:?} of the catalog that is there now is another than before; open it anew: {}",
+                    catalog.location()
+                );
+            }
+            let revision = entry.revision;
+            inner.builder.tiles().index().reload().await?;
+            inner.builder.tiles().damaged().forget(|_| true);
+            inner.count_anew(revision);
+            *seen = Seen { revision, replaced };
+            continue;
+        }
+        let changes = match catalog.changes_after(&name, seen.revision).await {
             Err(CatalogError::Missed { revision, .. }) => {
                 let Some(inner) = inner.upgrade() else {
                     return Ok(());
                 };
                 inner.builder.tiles().index().reload().await?;
                 inner.builder.tiles().damaged().forget(|_| true);
-                inner.tell_missed(revision);
-                *seen = revision;
+                inner.tell_missed(revision + inner.counted().ahead);
+                seen.revision = revision;
                 continue;
             }
             changes => changes?,
@@ -66,10 +109,11 @@ async fn catch_up(
         let turned = inner.builder.tiles().index().apply(&changes).await;
         let changed = |section| changes.iter().any(|change| change.section == section);
         inner.builder.tiles().damaged().forget(changed);
+        let ahead = inner.counted().ahead;
         let told = changes.iter().map(|change| {
             let all = turned.contains(&change.section);
             Change {
-                revision: change.revision,
+                revision: change.revision + ahead,
                 voxels: inner.builder.touched(change.voxels, all),
                 reason: reason(change.reason),
             }
@@ -77,7 +121,7 @@ async fn catch_up(
         for change in merged(told.collect()) {
             inner.forget(change.voxels);
             inner.changes.send(change);
-            *seen = change.revision;
+            seen.revision = change.revision - ahead;
         }
     }
     Ok(())
@@ -85,7 +129,10 @@ async fn catch_up(
 
 impl Inner {
     /// What has changed after a revision, as long as the catalog keeps it.
-    pub(super) async fn changes_after(&self, mut revision: u64) -> Option<Vec<Change>> {
+    pub(super) async fn changes_after(&self, revision: u64) -> Option<Vec<Change>> {
+        let Counted { ahead, from } = *self.counted();
+        // What was told before is of a catalog that is no more.
+        let mut revision = revision.checked_sub(ahead).filter(|_| revision >= from)?;
         let (catalog, name) = (self.builder.tiles().index().catalog(), &self.volume.name);
         let mut all = Vec::new();
         let known = async {
@@ -98,7 +145,7 @@ impl Inner {
                 revision = last.revision;
                 // Which sections had their first tile or lost their last is not kept: each may have.
                 all.extend(changes.iter().map(|change| Change {
-                    revision: change.revision,
+                    revision: change.revision + ahead,
                     voxels: self.builder.touched(change.voxels, true),
                     reason: reason(change.reason),
                 }));
@@ -112,6 +159,18 @@ impl Inner {
                 None
             }
         }
+    }
+
+    fn counted(&self) -> MutexGuard<'_, Counted> {
+        self.counted.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Another catalog is at this revision: anything may be another, and what is told goes on from what was told.
+    fn count_anew(&self, revision: u64) {
+        let from = self.changes.revision() + 1;
+        let ahead = from.saturating_sub(revision);
+        *self.counted() = Counted { ahead, from };
+        self.tell_missed(revision + ahead);
     }
 
     /// Away for longer than changes are kept: anything may be another.

@@ -24,7 +24,7 @@ pub(super) struct Fixture {
     /// By id in the catalog.
     pub(super) tiles: BTreeMap<i64, RawTile>,
     changes: u64,
-    _folder: tempfile::TempDir,
+    folder: tempfile::TempDir,
 }
 
 /// Whole levels of a channel, as a source or the oracle has them.
@@ -53,8 +53,19 @@ impl Fixture {
             storage,
             tiles: BTreeMap::new(),
             changes: 0,
-            _folder: folder,
+            folder,
         }
+    }
+
+    /// Puts the catalog of another in the place of this one's, and all that it says of tiles. Neither may write any more.
+    pub(super) async fn take_catalog_of(&mut self, other: &Self) {
+        other.archive.catalog().close().await;
+        let file = |fixture: &Self, end| fixture.folder.path().join(format!("catalog.sqlite{end}"));
+        for end in ["", "-wal", "-shm"] {
+            let _what_there_is = std::fs::remove_file(file(self, end));
+        }
+        std::fs::copy(file(other, ""), file(self, "")).unwrap();
+        self.tiles.clone_from(&other.tiles);
     }
 
     pub(super) async fn open(&self) -> StitchedSource {

@@ -1,11 +1,14 @@
 //! What has changed since somebody was here last.
 
+use std::time::Duration;
+
+use futures::StreamExt;
 use glam::{DVec3, UVec3};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::fixture::{Fixture, read_all, tile};
+use super::fixture::{Fixture, difference, read_all, tile};
 use super::run;
-use crate::VolumeSource;
+use crate::{ChangeReason, VolumeSource};
 
 async fn three_tiles() -> Fixture {
     let extent = UVec3::new(300, 100, 5);
@@ -77,5 +80,63 @@ fn what_is_no_longer_kept_is_not_told() {
         let last = source.changes_after(now - 1).await.unwrap();
         assert_eq!(last.len(), 1);
         assert_eq!(source.changes_after(now).await, Some(Vec::new()));
+    });
+}
+
+/// Revisions that are told never go back, though those of the other catalog do.
+#[test]
+fn another_catalog_in_the_place_of_the_open_one_is_shown_and_followed() {
+    run(async {
+        let mut fixture = three_tiles().await;
+        let extent = fixture.volume.extent();
+        let storage = fixture.storage.clone();
+        let mut other = Fixture::on(storage, extent, DVec3::new(4.0, 4.0, 30.0)).await;
+        let elsewhere = tile((80, 130), 1, (20.0, -3.0), 5.0, 1.0, 77);
+        other.put("other", elsewhere).await;
+
+        let source = fixture.open().await;
+        let (first, before) = (source.revision(), read_all(&source).await);
+        assert_eq!(first, 3);
+        let mut changes = source.changes();
+        fixture.take_catalog_of(&other).await;
+        let next = tokio::time::timeout(Duration::from_secs(20), changes.next());
+        let change = next.await.expect("it is noticed").unwrap();
+        let whole = VoxelBox::of_size(extent);
+        assert_eq!(
+            (change.reason, change.voxels),
+            (ChangeReason::Missed, whole)
+        );
+        assert!(change.revision > first && source.revision() == change.revision);
+        let now = read_all(&source).await;
+        let (coverage, most) = difference(&now, &fixture.expected());
+        assert!(coverage == 0 && most <= 1, "{coverage} {most}");
+        assert_ne!(now, before);
+        assert_eq!(
+            source.changes_after(first).await,
+            None,
+            "of another catalog"
+        );
+        assert_eq!(
+            source.changes_after(change.revision).await,
+            Some(Vec::new())
+        );
+
+        // Whoever opens it now writes to it.
+        let catalog = fixture.archive.catalog().location().clone();
+        let writing = saccade_archive::catalog::Catalog::open(catalog)
+            .await
+            .unwrap();
+        writing.delete_tile("v", "other", 9).await.unwrap();
+        let next = tokio::time::timeout(Duration::from_secs(20), changes.next());
+        let deleted = next.await.expect("it is followed").unwrap();
+        assert_eq!(deleted.reason, ChangeReason::Deleted);
+        assert_eq!(deleted.revision, change.revision + 1);
+        assert_eq!(
+            source.changes_after(change.revision).await.unwrap(),
+            [deleted]
+        );
+        fixture.tiles.clear();
+        let (coverage, most) = difference(&read_all(&source).await, &fixture.expected());
+        assert_eq!((coverage, most), (0, 0), "nothing is there any more");
     });
 }

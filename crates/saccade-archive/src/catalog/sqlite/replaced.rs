@@ -1,0 +1,283 @@
+//! A file that loses its place while it is open: those who read go on with what comes to its place.
+
+use std::fs::Metadata;
+use std::path::Path;
+use std::sync::atomic::AtomicU64;
+use std::sync::atomic::Ordering::{Acquire, Release};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::SystemTime;
+
+use sqlx::SqlitePool;
+
+use super::{Access, FileId, Opened, open_again};
+use crate::catalog::CatalogError;
+
+/// Looks at a file in the place of the open one that must find it unchanged, before it is opened: it may still be copied.
+const AT_REST: u32 = 3;
+
+/// A file of SQLite's is not less \[bytes\].
+const SMALLEST: u64 = 512;
+
+/// What took the place of an open file.
+#[derive(Debug, Default)]
+pub(in crate::catalog) struct Replaced {
+    newer: Mutex<Option<Box<Opened>>>,
+    /// Times that another file was opened.
+    times: AtomicU64,
+    away: Mutex<Option<Away>>,
+    coming: Mutex<Coming>,
+}
+
+/// There is nothing to read.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(in crate::catalog) struct Away {
+    /// Why what has the place cannot be read, if there is something.
+    pub(in crate::catalog) why: Option<String>,
+}
+
+/// A file that has come to the place of the open one, and for how many looks it has been as it is.
+#[derive(Debug, Default)]
+struct Coming {
+    look: Option<(FileId, u64, SystemTime)>,
+    looks: u32,
+}
+
+/// Which file has the name of the open one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::catalog) enum Place {
+    /// The open one.
+    Same,
+    /// None, or one that is still being written.
+    Nobody,
+    /// Another.
+    Another,
+}
+
+impl Opened {
+    /// Connections to the file that is to be read.
+    pub(in crate::catalog) fn readers(&self) -> SqlitePool {
+        let newer = lock(&self.replaced.newer);
+        newer
+            .as_ref()
+            .map_or(&self.readers, |newer| &newer.readers)
+            .clone()
+    }
+
+    /// What may be done with the file that is to be read.
+    pub(in crate::catalog) fn reading(&self) -> Access {
+        let newer = lock(&self.replaced.newer);
+        newer.as_ref().map_or(self.access, |newer| newer.access)
+    }
+
+    /// Times that another file took the place of the open one, and is read since.
+    pub(in crate::catalog) fn times_replaced(&self) -> u64 {
+        self.replaced.times.load(Acquire)
+    }
+
+    /// Whether nothing can be read.
+    pub(in crate::catalog) fn away(&self) -> Option<Away> {
+        lock(&self.replaced.away).clone()
+    }
+
+    /// Lets nothing be read, or all again. Whether that is news.
+    pub(in crate::catalog) fn set_away(&self, away: Option<Away>) -> bool {
+        let mut known = lock(&self.replaced.away);
+        let is_news = *known != away;
+        *known = away;
+        is_news
+    }
+
+    /// Looks which file has its name.
+    pub(in crate::catalog) fn place(&self) -> Place {
+        let open = lock(&self.replaced.newer);
+        let open = open.as_ref().map_or(self.id, |newer| newer.id);
+        let (Some(open), found) = (open, look(&self.path)) else {
+            return Place::Same;
+        };
+        let found = match found {
+            Ok(found) => found,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => None,
+            // A disk that cannot be asked tells by itself.
+            Err(_) => return Place::Same,
+        };
+        let mut coming = lock(&self.replaced.coming);
+        if found.is_some_and(|(id, ..)| id == open) {
+            *coming = Coming::default();
+            return Place::Same;
+        }
+        if coming.look != found {
+            *coming = Coming {
+                look: found,
+                looks: 0,
+            };
+        }
+        coming.looks = coming.looks.saturating_add(1);
+        match found {
+            Some((_, bytes, _)) if bytes >= SMALLEST && coming.looks > AT_REST => Place::Another,
+            _ => Place::Nobody,
+        }
+    }
+
+    /// Opens what has its name now, for reading. Nothing can be written by this one from then on.
+    pub(in crate::catalog) async fn open_again(&self) -> Result<(), CatalogError> {
+        // First all are closed: SQLite takes what lies beside a file for that of any of its name.
+        self.close_connections().await;
+        let newer = open_again(&self.path).await?;
+        if self.is_closed() {
+            newer.readers.close().await;
+        }
+        *lock(&self.replaced.newer) = Some(Box::new(newer));
+        self.replaced.times.fetch_add(1, Release);
+        Ok(())
+    }
+}
+
+/// What a file looks like; `None` if the system does not tell files from one another.
+fn look(path: &Path) -> std::io::Result<Option<(FileId, u64, SystemTime)>> {
+    let id = FileId::of(path)?;
+    let meta: Metadata = std::fs::metadata(path)?;
+    Ok(Some((id, meta.len(), meta.modified()?)))
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+    use std::time::{Duration, Instant};
+
+    use glam::{DVec3, UVec2, UVec3};
+    use saccade_core::transform::SectionFromTile;
+    use saccade_core::volume::Volume;
+
+    use super::*;
+    use crate::catalog::{Catalog, NewTile};
+
+    const SOON: Duration = Duration::from_secs(20);
+
+    /// A catalog with so many tiles.
+    async fn with_tiles(path: &Path, count: u32) -> Catalog {
+        let catalog = Catalog::create(path).await.unwrap();
+        let volume = Volume::new("v", UVec3::new(64, 64, 4), DVec3::ONE).unwrap();
+        catalog.create_volume(&volume).await.unwrap();
+        for n in 0..count {
+            let name = n.to_string();
+            let tile = NewTile {
+                pyramid: format!("{name}.tif"),
+                name,
+                section: 0,
+                channel: 0,
+                size: UVec2::splat(8),
+                transform: SectionFromTile::IDENTITY,
+                position: n.into(),
+            };
+            catalog.commit_tile("v", &tile).await.unwrap();
+        }
+        catalog
+    }
+
+    fn files(path: &Path) -> [PathBuf; 3] {
+        let of = |end: &str| PathBuf::from(format!("{}{end}", path.display()));
+        [path.to_owned(), of("-wal"), of("-shm")]
+    }
+
+    fn rename(from: &Path, to: &Path) {
+        for (from, to) in files(from).iter().zip(files(to)) {
+            if from.exists() {
+                std::fs::rename(from, to).unwrap();
+            }
+        }
+    }
+
+    async fn until<T>(mut is_so: impl AsyncFnMut() -> Option<T>) -> T {
+        let begun = Instant::now();
+        loop {
+            if let Some(so) = is_so().await {
+                return so;
+            }
+            assert!(begun.elapsed() < SOON, "not in time");
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+
+    async fn away(catalog: &Catalog) -> CatalogError {
+        until(async || catalog.entry("v").await.err()).await
+    }
+
+    #[tokio::test]
+    async fn who_reads_is_told_that_the_file_is_away_and_goes_on_with_what_comes_to_its_place() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalog.sqlite");
+        let [aside, other] = ["aside", "other"].map(|name| folder.path().join(name));
+        let catalog = with_tiles(&path, 3).await;
+        with_tiles(&other, 1).await.close().await;
+        let mut heard = catalog.subscribe("v").await.unwrap();
+        heard.borrow_and_update();
+
+        rename(&path, &aside);
+        let error = away(&catalog).await;
+        let said = error.to_string();
+        assert!(
+            matches!(error, CatalogError::Away { .. }) && error.is_transient(),
+            "{said}"
+        );
+        assert!(
+            said.contains("moved, deleted or replaced") && said.contains("put it back"),
+            "{said}"
+        );
+        rename(&aside, &path);
+        let tiles = async || catalog.entry("v").await.ok().map(|entry| entry.tiles);
+        assert_eq!(until(tiles).await, 3);
+        assert_eq!(catalog.times_replaced(), 0, "it is the same");
+        catalog.delete_tile("v", "2", 9).await.unwrap();
+
+        // Something else, and a file that is only beginning to be copied.
+        rename(&path, &aside);
+        std::fs::write(&path, vec![7; 4096]).unwrap();
+        let error = until(async || {
+            let error = catalog.entry("v").await.err()?;
+            error
+                .to_string()
+                .contains("cannot be read")
+                .then_some(error)
+        });
+        assert!(matches!(
+            error.await,
+            CatalogError::Away { why: Some(_), .. }
+        ));
+        std::fs::write(&path, "").unwrap();
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        assert!(catalog.entry("v").await.is_err());
+        assert_eq!(
+            std::fs::metadata(&path).unwrap().len(),
+            0,
+            "nobody made a catalog of it"
+        );
+
+        heard.borrow_and_update();
+        std::fs::copy(&other, &path).unwrap();
+        assert_eq!(until(tiles).await, 1);
+        assert_eq!(catalog.times_replaced(), 1);
+        tokio::time::timeout(SOON, heard.wait_for(|revision| *revision == 1))
+            .await
+            .expect("subscribers wake, though the revision is less than it was")
+            .unwrap();
+        let refused = catalog.delete_tile("v", "0", 9).await.unwrap_err();
+        assert!(matches!(refused, CatalogError::Moved { .. }), "{refused}");
+
+        // Who writes there is followed.
+        let writing = Catalog::open(path.as_path()).await.unwrap();
+        writing.delete_tile("v", "0", 9).await.unwrap();
+        tokio::time::timeout(SOON, heard.wait_for(|revision| *revision == 2))
+            .await
+            .expect("it is followed")
+            .unwrap();
+        assert_eq!(tiles().await, Some(0));
+        // The first one comes back, in the place of the second.
+        writing.close().await;
+        rename(&aside, &path);
+        until(async || tiles().await.filter(|&tiles| tiles == 2)).await;
+    }
+}
