@@ -34,8 +34,8 @@ pub(super) fn stem(file: &str) -> &str {
         .map_or(name, |(stem, _)| if stem.is_empty() { name } else { stem })
 }
 
-/// Reads a tile list. Columns are separated by white space; file names may contain blanks. Empty
-/// lines and lines that begin with `#` are skipped.
+/// Reads a tile list. Columns are separated by white space, or all by commas; file names may contain blanks. Empty
+/// lines and lines that begin with `#` are skipped, and a first line that names the last columns `x`, `y` and `z`.
 ///
 /// # Errors
 ///
@@ -62,6 +62,9 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionEr
         if text.is_empty() || text.starts_with('#') {
             continue;
         }
+        if tiles.is_empty() && is_header(text) {
+            continue;
+        }
         tiles.push(listed(text).map_err(|reason| AcquisitionError::Line {
             line,
             reason,
@@ -71,16 +74,40 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionEr
     Ok(tiles)
 }
 
-fn listed(text: &str) -> Result<ListedTile, String> {
-    let mut file = text;
-    let mut column = || {
-        let (rest, last) = file
-            .rsplit_once(char::is_whitespace)
-            .ok_or_else(|| format!("{} is not `file x y z`", quoted(text)))?;
-        file = rest.trim_end();
-        Ok::<_, String>(last)
+/// File, x, y and z of a line. Commas count only where they separate all of them: a decimal comma is none of these.
+fn columns(text: &str) -> Option<[&str; 4]> {
+    let split = |is_end: fn(char) -> bool| {
+        let mut file = text;
+        let mut column = || {
+            let (rest, last) = file.rsplit_once(is_end)?;
+            file = rest.trim_end();
+            Some(last.trim())
+        };
+        let (z, y, x) = (column()?, column()?, column()?);
+        Some([file, x, y, z])
     };
-    let (z, y, x) = (column()?, column()?, column()?);
+    let is_written = |columns: &[&str; 4]| {
+        !columns[1..]
+            .iter()
+            .any(|text| text.contains([',', ' ', '\t']))
+    };
+    let by_commas = split(|c| c == ',').filter(is_written);
+    by_commas.or_else(|| split(char::is_whitespace))
+}
+
+fn is_header(text: &str) -> bool {
+    let named = |columns: [&str; 4]| {
+        columns[1..]
+            .iter()
+            .zip(["x", "y", "z"])
+            .all(|(a, b)| a.eq_ignore_ascii_case(b))
+    };
+    columns(text).is_some_and(named)
+}
+
+fn listed(text: &str) -> Result<ListedTile, String> {
+    let [file, x, y, z] =
+        columns(text).ok_or_else(|| format!("{} is not `file x y z`", quoted(text)))?;
     let number = |what: &str, text: &str| match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
         _ => Err(format!("{what} is {}, which is no number", quoted(text))),
@@ -188,6 +215,32 @@ mod tests {
             fs::write(&path, format!("ok.tif 1 2 3\n{bad}\n")).unwrap();
             let refused = matches!(read(&path), Err(AcquisitionError::Line { line: 2, .. }));
             assert!(refused, "{bad}");
+        }
+    }
+
+    #[test]
+    fn commas_and_a_header_are_as_good_as_blanks() {
+        let read = |text: &str| parse(text.as_bytes(), Path::new("list.csv"));
+        let tiles = read("file,x,y,z\na b.tif,1.5,-2,7\nc,1.tif, 1, 2, 3\n").unwrap();
+        assert_eq!((tiles[0].file.as_str(), tiles[0].section), ("a b.tif", 7));
+        assert_eq!(tiles[0].corner, DVec2::new(1.5, -2.0));
+        assert_eq!((tiles[1].file.as_str(), tiles[1].section), ("c,1.tif", 3));
+        assert_eq!(
+            read("# by hand\nImage X Y Z\na.tif 1 2 3\n").unwrap().len(),
+            1
+        );
+        assert_eq!(read("a,b.tif 1 2 3\n").unwrap()[0].file, "a,b.tif");
+        for bad in [
+            "a.tif 0,5 3,2 1",
+            "a.tif,1,2",
+            "a.tif;1;2;3",
+            "a.tif 1 2 3\nfile x y z",
+            "a.tif,0,5 3,2 1",
+        ] {
+            assert!(
+                matches!(read(bad), Err(AcquisitionError::Line { .. })),
+                "{bad}"
+            );
         }
     }
 
