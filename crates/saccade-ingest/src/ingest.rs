@@ -18,6 +18,8 @@
 //! is taken up. A file that is not whole yet is waited for, as long as it still changes, and so are records that
 //! were cut shorter than what was read of them.
 
+mod absent;
+mod away;
 mod enter;
 mod error;
 mod images;
@@ -29,6 +31,7 @@ mod records;
 mod run;
 mod waiting;
 
+pub use away::wait_until_there;
 pub use error::IngestError;
 pub use options::IngestOptions;
 pub use run::{Summary, run};

@@ -184,6 +184,22 @@ pub fn file_name(file: &str) -> &str {
         .unwrap_or(file)
 }
 
+/// Whether `kept` holds the records of what is, or was, at `folder`.
+pub fn was_followed(folder: &Path, kept: &Path) -> bool {
+    let linked = fs::read_link(kept.join(LINK)).ok();
+    // What is away has no canonical name, but the folder around it may.
+    let around = folder
+        .parent()
+        .and_then(|around| around.canonicalize().ok());
+    let moved = { around.zip(folder.file_name()) }.map(|(around, name)| around.join(name));
+    let known = [
+        folder.canonicalize().ok(),
+        moved,
+        std::path::absolute(folder).ok(),
+    ];
+    linked.is_some_and(|linked| known.contains(&Some(linked)))
+}
+
 /// Pauses for which a file whose head cannot be read may stay as it is, before ingest is told and sets it
 /// aside.
 const PATIENCE: u32 = 120;

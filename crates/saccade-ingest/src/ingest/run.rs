@@ -178,7 +178,7 @@ fn called(
 }
 
 /// What people call this worker.
-fn worker_name() -> String {
+pub(super) fn worker_name() -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     format!("{}:{}", host.trim(), std::process::id())
 }
@@ -249,6 +249,8 @@ impl Ingest<'_> {
             for notice in self.room.news(images) {
                 self.context.progress.notice(&notice);
             }
+            let came = self.room.came(images);
+            self.take_up(came).await?;
             let due: VecDeque<_> = due.into_iter().map(Job::from).collect();
             let worked = self.work(due).await?;
             self.delete_retired().await?;
@@ -317,6 +319,23 @@ impl Ingest<'_> {
         self.summary.deleted += read.deleted;
         self.summary.quarantined = self.context.set_aside.count();
         Ok(worked)
+    }
+
+    /// Puts records in the queue whose image came after they were set aside.
+    async fn take_up(&self, came: Vec<Waiting>) -> Result<(), IngestError> {
+        if came.is_empty() {
+            return Ok(());
+        }
+        let catalog = self.archive.catalog();
+        let queue = async || {
+            let mut commit = catalog.begin(self.context.volume).await?;
+            for waiting in &came {
+                commit.enqueue(waiting).await?;
+            }
+            commit.finish().await
+        };
+        retry(self.options, self.context.progress, queue).await?;
+        Ok(())
     }
 
     async fn count(&self) -> Result<(u64, u64), IngestError> {

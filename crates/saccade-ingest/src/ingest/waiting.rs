@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use saccade_archive::catalog::Waiting;
 
+use super::absent::Absent;
 use super::images::Images;
 use super::prepare::{Look, Outcome, WaitKind, look, quarantine};
 
@@ -15,6 +16,8 @@ const LONGEST_PAUSE: u64 = 16;
 #[derive(Debug)]
 pub(super) struct WaitingRoom {
     records: BTreeMap<u64, Guest>,
+    /// Those that were given up since there was no file.
+    absent: Absent,
     poll: u64,
     patience: u64,
     interval: Duration,
@@ -62,6 +65,7 @@ impl WaitingRoom {
         let records = records.collect();
         Self {
             records,
+            absent: Absent::default(),
             poll: 0,
             patience: u64::from(patience),
             interval,
@@ -119,6 +123,11 @@ impl WaitingRoom {
         told
     }
 
+    /// Records that were given up since there was no file, of which there is one now.
+    pub(super) fn came(&mut self, images: Images<'_>) -> Vec<Waiting> {
+        self.absent.came(images)
+    }
+
     /// A record is done with, whatever became of it.
     pub(super) fn leave(&mut self, position: u64) {
         self.records.remove(&position);
@@ -161,6 +170,16 @@ impl WaitingRoom {
             let seconds = self.interval.saturating_mul(polls).as_secs_f64();
             let again = images.again();
             let reason = match guest.kind {
+                WaitKind::Incomplete if now.is_none() && images.are_watched() => format!(
+                    "{reason}. The file did not come back within {seconds:.1} s; once it is whole, {again}"
+                ),
+                WaitKind::Incomplete if now.is_none() => {
+                    self.absent.add(guest.waiting.clone());
+                    format!(
+                        "{reason}. It did not come within {seconds:.1} s; should it come while `saccade ingest` goes on, it \
+                         is taken in, else {again} once it is there"
+                    )
+                }
                 WaitKind::Incomplete => format!(
                     "{reason}. The file has not changed for {seconds:.1} s; once it is mended, {again}"
                 ),

@@ -10,7 +10,7 @@ use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, refuse_lin
 use saccade_core::volume::Dtype;
 use saccade_ingest::ingest::IngestOptions;
 use saccade_ingest::replay::find_list;
-use saccade_ingest::watch::{ListConfig, Pattern, WatchConfig, kept_list};
+use saccade_ingest::watch::{ListConfig, Pattern, WatchConfig, kept_list, was_followed};
 
 use crate::arguments::{corner, extent, pitch, scale, voxel_nm};
 use crate::report::say;
@@ -151,6 +151,29 @@ impl Bare {
             }
             Err(e) => Err(e.into()),
         }
+    }
+
+    /// What was followed before and is not there now, and what to call it to those who look from elsewhere.
+    pub(crate) fn away(&self, folder: &Path, kept: &Path) -> Option<(PathBuf, &'static str)> {
+        if !was_followed(folder, kept) {
+            return None;
+        }
+        if !folder.is_dir() {
+            return Some((folder.to_owned(), "the folder"));
+        }
+        let list = kept_list(folder, kept)?;
+        // Another one is another matter.
+        let is_meant = self.list.as_ref().is_none_or(|named| {
+            let named = std::path::absolute(named).unwrap_or_else(|_| named.clone());
+            let around = named.parent().and_then(|around| around.canonicalize().ok());
+            let named = match (around, named.file_name()) {
+                (Some(around), Some(name)) => around.join(name),
+                _ => named,
+            };
+            named == list
+        });
+        (is_meant && self.pattern.is_none() && !list.is_file())
+            .then_some((list, "the list of its tiles"))
     }
 
     /// An option that folders with records have no use for, if one is given.

@@ -10,7 +10,7 @@ use saccade_archive::catalog::Catalog;
 use saccade_archive::pyramid::{Encoding, PyramidIndex};
 use saccade_archive::{ArchiveLocation, CatalogLocation, VisualizationArchive};
 use saccade_core::volume::{Dtype, VoxelKind, check_name};
-use saccade_ingest::ingest::{IngestOptions, Summary, run};
+use saccade_ingest::ingest::{IngestOptions, Summary, run, wait_until_there};
 use saccade_ingest::watch::{self, Disk, ListWatch, Until, Watch};
 use saccade_ingest::{Cancel, HeldUp};
 use tokio::task::JoinHandle;
@@ -259,6 +259,39 @@ impl Ingest {
         })
     }
 
+    /// Waits for a folder or a list that was followed before and is not there, as one that is followed is waited for.
+    async fn wait_for_what_is_away(
+        &self,
+        location: &ArchiveLocation,
+        name: &str,
+        kept: &Path,
+        cancel: &Cancel,
+    ) -> Result<()> {
+        let away = || self.bare.away(&self.acquisition, kept);
+        let Some((path, what)) = away() else {
+            return Ok(());
+        };
+        let path = path.display();
+        log::warn!(
+            "{what} that was followed before is not there, and is waited for; check its disk or network, or end this with \
+             Ctrl-C: {path}"
+        );
+        let opened = waited_for(|| VisualizationArchive::create(location));
+        let archive = tokio::select! {
+            archive = opened => archive?,
+            () = cancel.cancelled() => return Ok(()),
+        };
+        let why =
+            format!("{what} that was followed before is not there; check its disk or network");
+        let options = IngestOptions::DEFAULT;
+        wait_until_there(&archive, name, &why, &options, || away().is_none(), cancel).await;
+        archive.catalog().close().await;
+        if !cancel.is_cancelled() {
+            log::warn!("{what} is there again: {path}");
+        }
+        Ok(())
+    }
+
     pub(crate) async fn run(self) -> Result<ExitCode> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
         let name = self
@@ -268,13 +301,21 @@ impl Ingest {
         let location = self.archive.location()?;
         let beside = beside(&location);
         let kept = beside.as_ref().map(|beside| beside.join(&name));
+        let cancel = cancel_when_interrupted();
+        // Who waits for the end is told that there is nothing, rather than kept.
+        if let Some(kept) = kept.as_ref().filter(|_| !self.once) {
+            self.wait_for_what_is_away(&location, &name, kept, &cancel)
+                .await?;
+            if cancel.is_cancelled() {
+                return Ok(ExitCode::SUCCESS);
+            }
+        }
         let followed = self
             .bare
             .followed(&self.acquisition, &name, kept.as_deref())?;
         if let Some(folder) = location.folder() {
             refuse_same_folder(&self.acquisition, folder)?;
         }
-        let cancel = cancel_when_interrupted();
         let opened = waited_for(|| VisualizationArchive::create(&location));
         let archive = tokio::select! {
             archive = opened => archive?,

@@ -280,6 +280,90 @@ fn what_a_list_waits_for_is_in_its_status() {
     until(&|held_up| held_up.is_empty());
 }
 
+/// As one that is followed while it goes away.
+#[test]
+fn what_was_followed_before_is_waited_for_when_it_is_away_at_the_start() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, away, archive] = ["scope", "away", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    picture(&scope, "a.png", 10);
+    let list = scope.join("list.txt");
+    std::fs::write(&list, "a.png 0 0 0\n").unwrap();
+    let ingest = [
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--voxel",
+        "4",
+        "--extent",
+        "99,99,9",
+    ];
+    std::fs::rename(&scope, &away).unwrap();
+    assert_failed(&run(ingest), 1, &["cannot read", text(&scope)]);
+    std::fs::rename(&away, &scope).unwrap();
+    done([&ingest[..], &["--once"]].concat());
+
+    let (_serving, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let status = || {
+        let answer = reqwest::get(format!("{url}v/scope/status.json"));
+        runtime.block_on(async {
+            answer
+                .await
+                .unwrap()
+                .json::<serde_json::Value>()
+                .await
+                .unwrap()
+        })
+    };
+    let until = |is_so: &dyn Fn(&serde_json::Value) -> bool| {
+        for _ in 0..600 {
+            let status = status();
+            if is_so(&status) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        panic!("it does not come about: {}", status());
+    };
+    let waits_for = |status: &serde_json::Value, what: &str| {
+        let why = status["held_up"][0]["why"].as_str().unwrap_or_default();
+        why.contains(what) && !why.contains(text(folder.path()))
+    };
+    std::fs::rename(&scope, &away).unwrap();
+    let following = Program::start_with(&ingest, &[]);
+    says(&following.stderr, "is waited for");
+    until(&|status| waits_for(status, "the folder that was followed before is not there"));
+    picture(&away, "b.png", 20);
+    std::fs::write(away.join("list.txt"), "a.png 0 0 0\nb.png 35 0 0\n").unwrap();
+    std::fs::rename(&away, &scope).unwrap();
+    says(&following.stderr, "is there again");
+    until(&|status| status["tiles"] == 2 && status["held_up"].as_array().unwrap().is_empty());
+    drop(following);
+
+    // The list alone, of which the option says where it should be; who waits for the end is told.
+    let aside = scope.join("aside");
+    std::fs::rename(&list, &aside).unwrap();
+    let named = [&ingest[..], &["--list", text(&list)]].concat();
+    assert_failed(
+        &run([&named[..], &["--once"]].concat()),
+        1,
+        &["the list of tiles is not there"],
+    );
+    let following = Program::start_with(&named, &[]);
+    says(&following.stderr, "is waited for");
+    until(&|status| {
+        waits_for(
+            status,
+            "the list of its tiles that was followed before is not there",
+        )
+    });
+    std::fs::write(&aside, "a.png 0 0 0\n").unwrap();
+    std::fs::rename(&aside, &list).unwrap();
+    says(&following.stderr, "is there again");
+    drop(following);
+}
+
 /// Followed, until it is told to end; a list that grows is taken in meanwhile.
 #[test]
 fn a_list_that_grows_is_followed() {

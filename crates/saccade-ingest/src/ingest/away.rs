@@ -1,0 +1,68 @@
+//! What was followed before and is away when work begins.
+
+use std::time::{Duration, SystemTime};
+
+use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::{CatalogError, Worker};
+use tokio::time::Instant;
+
+use super::IngestOptions;
+use super::process;
+use super::run::worker_name;
+use crate::Cancel;
+
+/// Between looks.
+const LOOKS: Duration = Duration::from_millis(500);
+
+/// Waits until what a volume is taken in from is there again, or that is cancelled. Those who look at the volume are told
+/// `why` it does not grow.
+pub async fn wait_until_there(
+    archive: &VisualizationArchive,
+    volume: &str,
+    why: &str,
+    options: &IngestOptions,
+    is_there: impl Fn() -> bool,
+    cancel: &Cancel,
+) {
+    let worker = match tell(archive, volume, why, options).await {
+        Ok(worker) => Some(worker),
+        Err(e) => {
+            log::debug!("why nothing goes on could not be told: {e}");
+            None
+        }
+    };
+    let mut sign = Instant::now();
+    while !is_there() && !cancel.is_cancelled() {
+        tokio::time::sleep(LOOKS).await;
+        if let Some(worker) = &worker
+            && sign.elapsed() > options.lease / 4
+        {
+            sign = Instant::now();
+            if let Err(e) = archive.catalog().keep_alive(worker).await {
+                log::debug!("no sign of life could be given: {e}");
+            }
+        }
+    }
+    if let Some(worker) = worker
+        && let Err(e) = archive.catalog().release(&worker).await
+    {
+        log::debug!("why nothing went on is told until the lease is over: {e}");
+    }
+}
+
+async fn tell(
+    archive: &VisualizationArchive,
+    volume: &str,
+    why: &str,
+    options: &IngestOptions,
+) -> Result<Worker, CatalogError> {
+    let catalog = archive.catalog();
+    catalog.volume(volume).await?;
+    let process = process::this().unwrap_or_default();
+    let worker = catalog
+        .register_process(&worker_name(), &process, options.lease)
+        .await?;
+    let reasons = [(why.to_owned(), SystemTime::now())];
+    catalog.tell_held_up(volume, &worker, &reasons).await?;
+    Ok(worker)
+}
