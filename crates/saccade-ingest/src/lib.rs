@@ -24,10 +24,12 @@ mod held_up;
 pub mod ingest;
 mod progress;
 pub mod replay;
+mod sense;
 pub mod simulate;
 pub mod update;
 #[cfg(unix)]
 pub mod watch;
+mod words;
 
 pub use cancel::Cancel;
 pub use held_up::{HeldUp, Part, Reason};

@@ -9,14 +9,16 @@
 //! What is said of tiles of one section, line after line, becomes so at once. Small groups share a transaction; none has
 //! more than [`MOST`] lines, so that ingest is not kept waiting.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::io::{self, BufRead, Read as _};
 use std::time::SystemTime;
 
 use saccade_archive::acquisition::{DeleteRecord, Record, TransformRecord};
 use saccade_archive::catalog::{Catalog, CatalogError, DeleteOutcome, TransformOutcome};
+use serde::de::IgnoredAny;
 
 use crate::Cancel;
+use crate::sense::{CHECK, nonsense};
 
 /// Most lines of one transaction.
 pub const MOST: usize = 16_384;
@@ -80,9 +82,7 @@ pub enum UpdateError {
         name: String,
     },
     /// The catalog cannot be used.
-    #[error(
-        "{done} of {all} lines were gone through before; what they say is so, and the rest is as it was"
-    )]
+    #[error("{}", so_far(*done, *all))]
     Catalog {
         /// Why.
         source: CatalogError,
@@ -123,15 +123,25 @@ pub fn read(mut input: impl BufRead, name: &str) -> Result<Vec<Line>, UpdateErro
         }
         let reason = match Record::parse(&text) {
             Ok(Record::Transform(record)) => {
-                let change = Change::Transform(record);
-                lines.push(Line { line, change });
-                continue;
+                let wrong = unknown_key(&text, &["record", "tile", "transform"]);
+                let nonsense = || Some(format!("{}; check {CHECK}", nonsense(record.transform)?));
+                match wrong.or_else(nonsense) {
+                    Some(reason) => reason,
+                    None => {
+                        let change = Change::Transform(record);
+                        lines.push(Line { line, change });
+                        continue;
+                    }
+                }
             }
-            Ok(Record::Delete(record)) => {
-                let change = Change::Delete(record);
-                lines.push(Line { line, change });
-                continue;
-            }
+            Ok(Record::Delete(record)) => match unknown_key(&text, &["record", "tile"]) {
+                Some(reason) => reason,
+                None => {
+                    let change = Change::Delete(record);
+                    lines.push(Line { line, change });
+                    continue;
+                }
+            },
             Ok(Record::Tile(_)) => {
                 "it is about a new tile, which only `saccade ingest` takes in; what counts here is \
                  \"transform\" and \"delete\""
@@ -154,6 +164,29 @@ pub fn read(mut input: impl BufRead, name: &str) -> Result<Vec<Line>, UpdateErro
     }
     let name = name.to_owned();
     Err(UpdateError::Lines { mistakes, name })
+}
+
+/// A key that says something of which nothing would come, as it is told.
+fn unknown_key(text: &[u8], known: &[&str]) -> Option<String> {
+    let keys: BTreeMap<String, IgnoredAny> = serde_json::from_slice(text).ok()?;
+    let unknown = keys.into_keys().find(|key| !known.contains(&&**key))?;
+    Some(format!(
+        "{unknown:?} means nothing here, where only {} count: leave it out",
+        known.join(", ")
+    ))
+}
+
+/// How far a file of changes came.
+fn so_far(done: usize, all: usize) -> String {
+    match done {
+        0 => format!(
+            "the catalog could not be changed, and none of the {all} lines took effect; give them again"
+        ),
+        done => format!(
+            "the catalog could not be changed any further: of {all} lines the first {done} took effect, and the others did \
+             not; give them again"
+        ),
+    }
 }
 
 /// What became of changes.

@@ -38,7 +38,7 @@ pub(crate) struct Stitching {
     #[arg(long, value_name = "FOLDER")]
     disk_cache: Option<PathBuf>,
 
-    /// What that folder may take [GB], or with another unit, such as 500MB or 1.5TB
+    /// What that folder may take [GB], or with another unit, such as 500MB or 1.5TB; 269MB at least
     #[arg(long, value_name = "GB", default_value = "20", value_parser = cache_size, requires = "disk_cache")]
     disk_cache_size: CacheSize,
 }
@@ -187,7 +187,9 @@ mod tests {
         ] {
             assert!(cache_size(bad).is_err(), "{bad}");
         }
+        // As the help says.
         assert!(cache_size("0").unwrap_err().contains("269 MB at least"));
+        assert!(cache_size("269MB").is_ok() && cache_size("268MB").is_err());
         for large in ["3TB", "2200", "1000000TB"] {
             let told = cache_size(large).unwrap_err();
             assert!(told.contains("2199 GB at most"), "{large}: {told}");

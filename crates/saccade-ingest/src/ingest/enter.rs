@@ -17,6 +17,7 @@ use super::run::{Summary, state};
 use super::waiting::WaitingRoom;
 use super::{IngestError, IngestOptions};
 use crate::progress::{Meter, Progress};
+use crate::sense::{CHECK, nonsense};
 
 /// Most records in one transaction: a sync for each would be slow for small tiles, and a
 /// transaction for thousands would keep other writers waiting.
@@ -158,18 +159,25 @@ impl Done {
                 TileOutcome::Superseded => self.orphans.push(tile.pyramid.clone()),
             },
             Outcome::Transform { record, position } => {
+                let misplaced = |reason| Quarantined {
+                    file: RecordReader::FILE.to_owned(),
+                    tile: Some(record.tile.clone()),
+                    reason,
+                    bytes: None,
+                    at: now,
+                };
+                if let Some(nonsense) = nonsense(record.transform) {
+                    let reason = format!(
+                        "{nonsense}; check {CHECK}, and append the record again; until then the tile stays where it is"
+                    );
+                    return self.quarantine(commit, &misplaced(reason)).await;
+                }
                 let moved = commit.transform(&record.tile, record.transform, Some(*position));
                 match moved.await {
                     Ok(TransformOutcome::Moved) => self.summary.moved += 1,
                     Ok(TransformOutcome::Unchanged | TransformOutcome::Kept) => {}
                     Err(outside @ CatalogError::OutsideVolume { .. }) => {
-                        let what = Quarantined {
-                            file: RecordReader::FILE.to_owned(),
-                            tile: Some(record.tile.clone()),
-                            reason: format!("{outside}; until then it stays where it is"),
-                            bytes: None,
-                            at: now,
-                        };
+                        let what = misplaced(format!("{outside}; until then it stays where it is"));
                         self.quarantine(commit, &what).await?;
                     }
                     Err(e) => return Err(e),

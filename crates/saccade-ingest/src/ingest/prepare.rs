@@ -12,14 +12,15 @@ use saccade_archive::catalog::{Catalog, NewTile, Quarantined, Waiting, place};
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
 use saccade_archive::storage::{Storage, StorageError};
-use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::enter::{SetAside, retry};
 use super::images::Images;
 use super::{IngestError, IngestOptions};
 use crate::progress::Progress;
+use crate::sense::{CHECK, nonsense};
 use crate::watch::{BEFORE_FIRST, Stamp};
+use crate::words::with_causes;
 
 /// What a file looks like from outside; another look means that someone writes to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -195,18 +196,13 @@ impl Context<'_> {
                           it again with one";
             return refused(reason.to_owned(), bytes);
         }
-        if !scale_is_sensible(transform) {
+        if let Some(nonsense) = nonsense(transform) {
             let check = if watched {
                 "--pixel: it is the size of a pixel in level-0 voxels"
             } else {
-                "the transform: it leads to level-0 voxels"
+                CHECK
             };
-            let reason = format!(
-                "a pixel of the tile would be larger than {LARGEST_PIXEL} voxels, or smaller than a \
-                 {LARGEST_PIXEL}th of one (transform {:?}); check {check}",
-                transform.elements(),
-            );
-            return refused(reason, bytes);
+            return refused(format!("{nonsense}; check {check}"), bytes);
         }
         if section == BEFORE_FIRST {
             let reason = "the number of its section is less than that of the first one; give the smallest with \
@@ -342,18 +338,6 @@ impl Context<'_> {
     }
 }
 
-/// Most voxels that a pixel may span along an axis, and most pixels that a voxel may.
-const LARGEST_PIXEL: f64 = 512.0;
-
-/// Whether pixels are about as large as an overview's, or a fine region's, could be.
-fn scale_is_sensible(transform: SectionFromTile) -> bool {
-    let [a, b, c, d, ..] = transform.elements();
-    let sensible = 1.0 / LARGEST_PIXEL..=LARGEST_PIXEL;
-    [a.hypot(b), c.hypot(d)]
-        .iter()
-        .all(|s| sensible.contains(s))
-}
-
 /// Why there is no pyramid.
 enum Refusal {
     Incomplete(String),
@@ -392,10 +376,20 @@ fn build(
             "the image has {width} x {height} pixels, but had others when it was found; rename whole images into \
              the folder"
         )),
-        ImageError::Unsupported { what } => Refusal::Never(format!(
-            "this kind of image cannot be read ({what}); convert it to a {}-bit grey TIFF or PNG",
-            8 * stored.dtype.bytes()
-        )),
+        ImageError::Unsupported { what } => {
+            let depth = match 8 * stored.dtype.bytes() {
+                8 => "an 8-bit".to_owned(),
+                bits => format!("a {bits}-bit"),
+            };
+            let then = if watched {
+                "rename that over this file"
+            } else {
+                "append the record again"
+            };
+            Refusal::Never(format!(
+                "this kind of image cannot be read ({what}); convert it to {depth} grey TIFF or PNG, and {then}"
+            ))
+        }
         _ => Refusal::Never(e.to_string()),
     })?;
     stored
@@ -504,7 +498,7 @@ impl Backoff {
         progress: &dyn Progress,
         error: &(dyn std::error::Error + Send + Sync + 'static),
     ) {
-        let why = with_sources(error);
+        let why = with_causes(error);
         if self.failures == 1 {
             progress.notice(&format!("{why}; trying again"));
         }
@@ -520,18 +514,11 @@ impl Backoff {
     }
 }
 
-fn with_sources(error: &(dyn std::error::Error + 'static)) -> String {
-    let chain = std::iter::successors(Some(error), |e| e.source());
-    chain
-        .map(ToString::to_string)
-        .collect::<Vec<_>>()
-        .join(": ")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use saccade_archive::storage::check_name;
+    use saccade_core::transform::SectionFromTile;
 
     #[test]
     fn outages_are_looked_after_often_and_other_failures_ever_less() {

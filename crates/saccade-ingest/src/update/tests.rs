@@ -218,6 +218,59 @@ async fn a_section_moves_at_once() {
     assert!(format!("{changed:?}").contains("Transform"), "{changed:?}");
 }
 
+#[test]
+fn what_makes_no_sense_is_refused_as_by_ingest() {
+    let line = |more: &str| {
+        format!(
+            r#"{{"record": "transform", "tile": "s0_0", "transform": [1, 0, 0, 1, 3, 2]{more}}}"#
+        )
+    };
+    let refused = |text: &str| read(text.as_bytes(), "a file").unwrap_err().to_string();
+    assert_eq!(lines(&[line("")]).len(), 1);
+    let said = refused(&line(r#", "section": 3"#));
+    assert!(
+        said.contains("line 1: \"section\" means nothing here"),
+        "{said}"
+    );
+    let said = refused(r#"{"record": "delete", "tile": "a", "file": "b"}"#);
+    assert!(
+        said.contains("\"file\"") && said.contains("nothing was changed"),
+        "{said}"
+    );
+    let small = r#"{"record": "transform", "tile": "s0_0", "transform": [1e-9, 0, 0, 1, 0, 0]}"#;
+    let said = refused(small);
+    assert!(
+        said.contains("smaller than a 512th") && said.contains("check the transform"),
+        "{said}"
+    );
+}
+
+#[test]
+fn who_meets_a_full_disk_is_told_how_many_lines_took_effect() {
+    let said = |done| {
+        let source = CatalogError::UnknownVolume {
+            name: VOLUME.to_owned(),
+            known: Vec::new(),
+        };
+        UpdateError::Catalog {
+            source,
+            done,
+            all: 9,
+        }
+        .to_string()
+    };
+    assert!(
+        said(0).contains("none of the 9 lines took effect"),
+        "{}",
+        said(0)
+    );
+    assert!(
+        said(4).contains("of 9 lines the first 4 took effect"),
+        "{}",
+        said(4)
+    );
+}
+
 #[tokio::test]
 async fn who_cancels_is_told_what_is_left() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,11 +1,11 @@
 //! Looking, again and again: how everything without records is followed.
 
 use std::error::Error;
-use std::fmt::Write as _;
 use std::time::Duration;
 
 use super::Next;
 use crate::held_up::{HeldUp, Part};
+use crate::words::with_causes;
 use crate::{Cancel, watch::WatchError};
 
 /// What is followed by looks.
@@ -93,7 +93,7 @@ pub(super) fn look_on<L: Looks>(
                 if !goes_on {
                     return Err(e);
                 }
-                let what = words(&e);
+                let what = with_causes(&e);
                 watch.held_up().tell(Part::Watch, Some(&what));
                 if what != said || failures.is_multiple_of(SAY_AGAIN) {
                     log::warn!("{what}; trying again");
@@ -110,15 +110,4 @@ pub(super) fn look_on<L: Looks>(
         }
     }
     Ok(told)
-}
-
-/// An error and what is behind it, in one line.
-fn words(error: &dyn Error) -> String {
-    let mut words = error.to_string();
-    let mut source = error.source();
-    while let Some(error) = source {
-        _ = write!(words, ": {error}");
-        source = error.source();
-    }
-    words
 }

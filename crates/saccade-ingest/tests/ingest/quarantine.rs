@@ -5,6 +5,7 @@ use std::fs;
 use glam::UVec2;
 use saccade_archive::acquisition::{Record, RecordReader, TileRecord};
 use saccade_archive::catalog::Quarantined;
+use saccade_core::transform::SectionFromTile;
 use saccade_ingest::Cancel;
 use saccade_ingest::ingest::run;
 
@@ -243,7 +244,69 @@ async fn a_device_in_place_of_an_image() {
 async fn a_file_that_never_comes() {
     let what = refused(|scope| scope.say(&tile_record("ghost", 0, SIZE))).await;
     assert_eq!((what.file.as_str(), what.bytes), ("tiles/ghost.tif", None));
-    says(&what, &["exists", "has not changed"]);
+    says(
+        &what,
+        &["exists", "did not come within", "append its record again"],
+    );
+    assert!(!what.reason.contains("has not changed"), "{}", what.reason);
+}
+
+/// However long after its record was set aside, as long as this run goes on.
+#[tokio::test]
+async fn a_file_that_comes_late_is_taken_in() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    scope.say(&tile_record("late", 0, SIZE));
+    let options = saccade_ingest::ingest::IngestOptions {
+        once: false,
+        ..quick()
+    };
+    let (diary, cancel) = (Diary::default(), Cancel::new());
+    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
+    let catalog = archive.catalog();
+    let other = async {
+        let set_aside = async || match catalog.quarantined(VOLUME).await {
+            Ok(set_aside) => set_aside.len(),
+            // Before the volume is made.
+            Err(_) => 0,
+        };
+        while set_aside().await == 0 {
+            tokio::time::sleep(options.poll).await;
+        }
+        assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, 0);
+        tokio::time::sleep(options.poll * 20).await;
+        scope.image("late", SIZE, 7);
+        while catalog.entry(VOLUME).await.unwrap().tiles == 0 {
+            tokio::time::sleep(options.poll).await;
+        }
+        assert_eq!(set_aside().await, 0);
+        cancel.cancel();
+    };
+    let both = async { tokio::join!(ingest, other) };
+    let both = tokio::time::timeout(std::time::Duration::from_secs(60), both).await;
+    let summary = both.expect("it is taken in").0.unwrap();
+    assert_eq!((summary.tiles, summary.quarantined), (1, 0));
+    assert_eq!(
+        pixels(&seen(&archive).await["late"]).await,
+        texture(SIZE, 7)
+    );
+}
+
+#[tokio::test]
+async fn a_kind_of_image_that_is_not_known() {
+    let what = refused(|scope| {
+        fs::write(
+            scope.file("bitmap"),
+            b"BM and so on, for long enough to be an image of some kind",
+        )
+        .unwrap();
+        scope.say(&tile_record("bitmap", 0, SIZE));
+    })
+    .await;
+    says(
+        &what,
+        &["convert it to an 8-bit grey TIFF or PNG, and append the record again"],
+    );
 }
 
 #[tokio::test]
@@ -273,7 +336,7 @@ async fn a_tile_without_a_name_or_of_an_absurd_scale() {
                 unreachable!()
             };
             let elements = [scale, 0.0, 0.0, scale, 0.0, 0.0];
-            record.transform = saccade_core::transform::SectionFromTile::new(elements).unwrap();
+            record.transform = SectionFromTile::new(elements).unwrap();
             scope.say(&Record::Tile(record));
         })
         .await;
@@ -333,6 +396,21 @@ async fn a_transform_out_of_the_volume() {
     let what = refused(|scope| scope.say(&move_record("before", at(5000.0, 0.0)))).await;
     assert_eq!(what.tile.as_deref(), Some("before"));
     says(&what, &["outside", "stays where it is"]);
+}
+
+#[tokio::test]
+async fn a_transform_of_an_absurd_scale() {
+    let small = SectionFromTile::new([1e-9, 0.0, 0.0, 1.0, 0.0, 0.0]).unwrap();
+    let what = refused(|scope| scope.say(&move_record("before", small))).await;
+    assert_eq!(what.tile.as_deref(), Some("before"));
+    says(
+        &what,
+        &[
+            "smaller than a 512th",
+            "stays where it is",
+            "append the record again",
+        ],
+    );
 }
 
 #[tokio::test]
