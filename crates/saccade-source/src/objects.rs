@@ -30,11 +30,11 @@ pub use folder::FolderObjects;
 pub use http::HttpObjects;
 #[cfg(not(target_family = "wasm"))]
 pub(crate) use http::chain;
+pub(crate) use http::{client, is_passing};
 pub use location::{Location, LocationError};
 pub use memory::MemoryObjects;
 pub(crate) use retry::Pace;
 pub use retry::Patience;
-#[cfg(not(target_family = "wasm"))]
 pub(crate) use retry::is_to_be_told;
 #[cfg(not(target_family = "wasm"))]
 pub use s3::S3Objects;
@@ -79,6 +79,16 @@ pub trait Objects: MaybeSend + MaybeSync + fmt::Debug {
     /// How to mend it, if all that was asked for so far was forbidden: then nothing is known of what is there.
     fn denied(&self) -> Option<&'static str> {
         None
+    }
+
+    /// From here on what is forbidden is an error ([`ObjectError::Unclear`]), also where it may just be missing: for those to whom a
+    /// hole that is none does lasting harm. Stores that always know the difference need not do anything.
+    fn stop_guessing(&self) {}
+
+    /// How often another object was found in place of this one, which each time one reader was told
+    /// ([`ObjectError::Replaced`]). What was read of its parts while this was another number was of another object.
+    fn replacements(&self, _key: &str) -> u64 {
+        0
     }
 
     /// What beginning another read takes, as bytes that could have been read meanwhile: parts of an

@@ -21,6 +21,15 @@ pub enum ObjectError {
         /// File or address.
         location: String,
     },
+    /// The store forbids it, as it forbids objects that nobody has: it may be missing.
+    #[error(
+        "access is denied, as it is to objects that are not there, so that this one may be missing or forbidden; log in, or let forbidden \
+         objects be taken for missing ones: {location}"
+    )]
+    Unclear {
+        /// Address.
+        location: String,
+    },
     /// The store answers with something else than the object.
     #[error("the answer is {answer}, not the object: {location}")]
     Answer {
@@ -86,6 +95,7 @@ impl ObjectError {
             Self::Key { key, .. } => return format!("{key:?} names nothing there"),
             Self::Io { source, .. } => return format!("its file cannot be read: {source}"),
             Self::Denied { location, .. }
+            | Self::Unclear { location }
             | Self::Answer { location, .. }
             | Self::Unavailable { location, .. }
             | Self::Replaced { location }

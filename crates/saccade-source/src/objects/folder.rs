@@ -234,6 +234,10 @@ impl Objects for FolderObjects {
         names.collect()
     }
 
+    fn replacements(&self, key: &str) -> u64 {
+        self.marks.replacements(key)
+    }
+
     fn read_cost(&self) -> u64 {
         16 << 10
     }

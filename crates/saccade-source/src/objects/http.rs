@@ -32,14 +32,16 @@ const ADVICE: &str = "the server wants credentials, or does not allow this objec
 ///
 /// # Answers
 ///
-/// 404 and 410 mean that there is no such object. 403 does as well where the store answers so for
+/// 404 and 410 (gone) both mean that there is no such object. 403 is taken to mean so as well where the store answers so for
 /// whatever it does not have, as S3 does to those who may not list: with a 403 it is asked for an object that nobody can
-/// have, and for one that was read before, so that a login that ran out is not taken for a hole. 401 is always an error.
+/// have, and for the newest one that was read before, so that a login that ran out is not taken for a hole. It is an error once the store
+/// has answered 404 or 410 for anything, for an object that could be read before, and wherever nobody guesses
+/// ([`Objects::stop_guessing`]). 401 is always an error.
 /// 429, 5xx, broken connections, cut and stalled answers are asked for again, see [`Patience`]. A server that ignores
 /// ranges is put up with, and told of.
 ///
 /// Parts of an object belong together: where the server tags what it sends (`ETag`) and a part has another tag than the one before,
-/// the object was replaced in between, which is an error. Browsers show tags only where the server exposes them.
+/// the object was replaced in between, which is told once ([`Objects::replacements`]). Browsers show tags only where the server exposes them.
 ///
 /// Natively, redirections to other hosts are not followed: whoever runs a store cannot make this computer ask others.
 ///
@@ -140,6 +142,7 @@ impl HttpObjects {
             Ok(bytes) => return Ok(Some(bytes)),
             Err(Refusal::Missing) => return Ok(None),
             Err(Refusal::Denied) => ADVICE,
+            Err(Refusal::Unclear) => return Err(ObjectError::Unclear { location }),
             Err(Refusal::Expired) => EXPIRED,
         };
         Err(ObjectError::Denied { advice, location })
@@ -185,7 +188,10 @@ impl HttpObjects {
                 Ok(answer)
             }
             Err(error) => {
-                Err(platform::unanswered(error, &shown(url), heard.load(Ordering::Relaxed)).await)
+                let shown = shown(url);
+                let why = platform::unanswered(error, &shown, heard.load(Ordering::Relaxed));
+                // A browser finds that out by another request.
+                Err(self.patience.idle(why).await.unwrap_or_else(|late| late))
             }
         }
     }
@@ -284,13 +290,26 @@ impl Objects for HttpObjects {
         self.refusals.all_refused().then_some(ADVICE)
     }
 
+    fn stop_guessing(&self) {
+        self.refusals.stop_guessing();
+    }
+
+    fn replacements(&self, key: &str) -> u64 {
+        self.tags.replacements(key) + self.times.replacements(key)
+    }
+
     fn read_cost(&self) -> u64 {
         256 << 10
     }
 }
 
+/// Who sends requests: natively, redirections to other hosts are not followed; a browser has rules of its own.
+pub(crate) fn client() -> Client {
+    platform::client()
+}
+
 /// Whether the same question may be answered better later.
-fn is_passing(status: StatusCode) -> bool {
+pub(crate) fn is_passing(status: StatusCode) -> bool {
     matches!(
         status,
         StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_MANY_REQUESTS

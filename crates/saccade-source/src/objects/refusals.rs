@@ -4,11 +4,16 @@
 //! sparse images there are refusals without end. A login that has run out looks the same, and what it hides is not
 //! empty. So each refusal is judged by what the store says *after* it: an object that could be read before and still
 //! can shows that the login was good when the refusal came. Refusals that came before the question share its answer.
+//!
+//! That they mean nothing is a guess, which is given up where it is contradicted: a store that says of any object that there is none
+//! (404, 410) would say so of this one, and one that could be read before is there. Where a hole for good would come of the guess, as in a
+//! copy of the image, nobody guesses ([`Refusals::stop_guessing`]).
 
-use std::sync::OnceLock;
+use std::sync::PoisonError;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use bytes::Bytes;
+use quick_cache::sync::Cache;
 use tokio::sync::Mutex;
 
 use super::ObjectError;
@@ -16,6 +21,8 @@ use crate::maybe_send::BoxFuture;
 
 /// Names an object that nobody has.
 pub(super) const NOBODYS: &str = "saccade-asks-whether-missing-objects-are-forbidden";
+/// Objects that were read, and are known to be there.
+const KNOWN: usize = 1 << 14;
 
 /// What a store answers to one question.
 #[derive(Debug)]
@@ -35,6 +42,8 @@ pub(super) enum Refusal {
     Missing,
     /// It may not be read.
     Denied,
+    /// Either of these: as objects that nobody has are refused as well, nobody can tell.
+    Unclear,
     /// Nothing may be read any more.
     Expired,
 }
@@ -44,14 +53,20 @@ pub(super) const EXPIRED: &str = "what could be read before is refused now; the 
      renew it and open the image again";
 
 /// What a store refused so far.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Refusals {
     /// Whether any answer was other than a refusal.
     heard: AtomicBool,
     /// Whether an object that nobody has was refused.
     forbids_missing: AtomicBool,
-    /// The first object that was read.
-    granted: OnceLock<String>,
+    /// Whether it said of any object that there is none.
+    tells_missing: AtomicBool,
+    /// Whether what is refused is not taken for missing, whatever else is refused.
+    guesses_no_more: AtomicBool,
+    /// Objects that were read.
+    granted: Cache<String, ()>,
+    /// The newest of them: an image's description may be open to all while its voxels are not.
+    newest: std::sync::Mutex<Option<String>>,
     /// Judgements that were begun.
     begun: AtomicU64,
     judged: Mutex<Judged>,
@@ -72,6 +87,21 @@ struct Judged {
     forbids: Option<(bool, bool)>,
 }
 
+impl Default for Refusals {
+    fn default() -> Self {
+        Self {
+            heard: AtomicBool::default(),
+            forbids_missing: AtomicBool::default(),
+            tells_missing: AtomicBool::default(),
+            guesses_no_more: AtomicBool::default(),
+            granted: Cache::new(KNOWN),
+            newest: std::sync::Mutex::default(),
+            begun: AtomicU64::default(),
+            judged: Mutex::default(),
+        }
+    }
+}
+
 impl Refusals {
     /// The object, or `None` if there is none, of what a store answers; `ask` asks for another one.
     pub(super) async fn settle<'a>(
@@ -84,16 +114,21 @@ impl Refusals {
         match found {
             Found::Object(bytes) => {
                 self.heard.store(true, Ordering::Relaxed);
-                self.granted.get_or_init(|| key.to_owned());
+                self.grant(key);
                 return Ok(Ok(bytes));
             }
             Found::Nothing => {
                 self.heard.store(true, Ordering::Relaxed);
+                self.tells_missing.store(true, Ordering::Relaxed);
                 return Ok(Err(Refusal::Missing));
+            }
+            // It is there.
+            Found::Forbidden if self.granted.get(key).is_some() => {
+                return Ok(Err(Refusal::Expired));
             }
             Found::Forbidden => {}
             Found::Unknown => {
-                let expired = self.granted.get().is_some();
+                let expired = self.newest().is_some();
                 return Ok(Err(if expired {
                     Refusal::Expired
                 } else {
@@ -145,23 +180,30 @@ impl Refusals {
                 ObjectError::TooShort { .. }
                 | ObjectError::TooLong { .. }
                 | ObjectError::Replaced { .. },
-            ) => Ok(Found::Nothing),
+            ) => Ok(Found::Object(Bytes::new())),
             asked => asked,
         };
-        let granted = self.granted.get();
+        let granted = self.newest();
+        let granted = granted.as_deref();
         let known = match *forbids {
             // Nothing is left to ask with before anything could be read.
             Some((refused, _)) if granted.is_none() => Some(refused),
             Some((true, true)) => Some(true),
             _ => None,
         };
+        let tells = || self.tells_missing.load(Ordering::Relaxed);
+        let known = if tells() { Some(false) } else { known };
         let refused = match known {
             Some(refused) => refused,
             None => match ask(NOBODYS).await? {
                 Found::Unknown if granted.is_some() => return Ok(Refusal::Expired),
                 Found::Unknown => return Ok(Refusal::Denied),
                 Found::Forbidden => true,
-                Found::Object(_) | Found::Nothing => false,
+                Found::Nothing => {
+                    self.tells_missing.store(true, Ordering::Relaxed);
+                    false
+                }
+                Found::Object(_) => false,
             },
         };
         if !refused {
@@ -169,18 +211,48 @@ impl Refusals {
             return Ok(Refusal::Denied);
         }
         // Asked last: what was refused before was refused to somebody who may read this.
-        if let Some(granted) = granted
-            && matches!(ask(granted).await?, Found::Forbidden | Found::Unknown)
-        {
-            return Ok(Refusal::Expired);
+        if let Some(granted) = granted {
+            match ask(granted).await? {
+                Found::Forbidden | Found::Unknown => return Ok(Refusal::Expired),
+                Found::Nothing => self.tells_missing.store(true, Ordering::Relaxed),
+                Found::Object(_) => {}
+            }
         }
-        if !self.forbids_missing.swap(true, Ordering::Relaxed) {
+        // Another may have been heard of meanwhile.
+        if tells() {
+            return Ok(Refusal::Denied);
+        }
+        *forbids = Some((true, granted.is_some()));
+        let guesses = !self.guesses_no_more.load(Ordering::Relaxed);
+        if !self.forbids_missing.swap(true, Ordering::Relaxed) && guesses {
             log::warn!(
                 "forbidden objects are taken for missing ones, as all missing ones are forbidden, such as {location}"
             );
         }
-        *forbids = Some((true, granted.is_some()));
-        Ok(Refusal::Missing)
+        Ok(match guesses {
+            true => Refusal::Missing,
+            false => Refusal::Unclear,
+        })
+    }
+
+    fn grant(&self, key: &str) {
+        if self.granted.get(key).is_none() {
+            self.granted.insert(key.to_owned(), ());
+        }
+        let mut newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        if newest.as_deref() != Some(key) {
+            *newest = Some(key.to_owned());
+        }
+    }
+
+    fn newest(&self) -> Option<String> {
+        let newest = self.newest.lock().unwrap_or_else(PoisonError::into_inner);
+        newest.clone()
+    }
+
+    /// What is refused from here on is never taken for missing.
+    pub(super) fn stop_guessing(&self) {
+        self.guesses_no_more.store(true, Ordering::Relaxed);
     }
 
     /// Whether all that was asked for so far was refused, even what there cannot be.

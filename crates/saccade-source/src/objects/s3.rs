@@ -181,6 +181,7 @@ impl S3Objects {
             Ok(bytes) => return Ok(Some(bytes)),
             Err(Refusal::Missing) => return Ok(None),
             Err(Refusal::Denied) => self.advice(),
+            Err(Refusal::Unclear) => return Err(ObjectError::Unclear { location }),
             Err(Refusal::Expired) => EXPIRED,
         };
         Err(ObjectError::Denied { advice, location })
@@ -342,6 +343,14 @@ impl Objects for S3Objects {
 
     fn denied(&self) -> Option<&'static str> {
         self.refusals.all_refused().then(|| self.advice())
+    }
+
+    fn stop_guessing(&self) {
+        self.refusals.stop_guessing();
+    }
+
+    fn replacements(&self, key: &str) -> u64 {
+        self.tags.replacements(key)
     }
 
     fn read_cost(&self) -> u64 {

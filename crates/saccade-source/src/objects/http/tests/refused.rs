@@ -132,3 +132,78 @@ async fn what_cannot_be_judged_is_told() {
         assert!(matches!(got, Ok(None)), "{got:?}");
     }
 }
+
+/// Who says of one object that there is none would say so of another.
+#[tokio::test]
+async fn what_is_forbidden_is_there_where_other_objects_are_missing() {
+    let server = TestServer::start(conformance::objects()).await;
+    *server.missing.lock().unwrap() = FORBIDDEN;
+    server.fail_always("c/long", Fault::Status(FORBIDDEN));
+    // By S3, whatever else is answered is asked again.
+    for (n, gone) in [(0, "404 Not Found"), (0, "410 Gone"), (1, "404 Not Found")] {
+        let store = server.stores(patience())[n].clone();
+        let long = async || store.read("c/long", Part::Range(0..4)).await;
+        ten(&*store).await.unwrap();
+        assert!(
+            matches!(long().await, Ok(None)),
+            "nothing speaks against it"
+        );
+        server.fail_next([Fault::Status(gone)]);
+        let got = store.read("labels/zarr.json", Part::Last(3)).await;
+        assert!(matches!(got, Ok(None)), "{got:?}");
+        for _ in 0..2 {
+            let error = long().await.unwrap_err();
+            let is_denied = matches!(error, ObjectError::Denied { .. });
+            assert!(is_denied && error.to_string().contains("c/long"), "{error}");
+        }
+    }
+}
+
+/// Descriptions are often open to all whose voxels are not.
+#[tokio::test]
+async fn what_could_be_read_before_is_no_hole() {
+    let server = TestServer::start(conformance::objects()).await;
+    *server.missing.lock().unwrap() = FORBIDDEN;
+    for store in server.stores(patience()) {
+        let part = async |key: &str| store.read(key, Part::Range(0..2)).await;
+        for key in [".zattrs", "a/b/ten", "c/long", ".zattrs"] {
+            assert!(part(key).await.unwrap().is_some(), "{key}");
+        }
+        server.fail_always("c/long", Fault::Status(FORBIDDEN));
+        let named = part("c/long").await.unwrap_err().to_string();
+        assert!(named.contains("run out"), "the very same: {named}");
+        assert!(matches!(part("none").await, Ok(None)));
+        server.fail_always("ten", Fault::Status(FORBIDDEN));
+        server.fail_always("empty", Fault::Status(FORBIDDEN));
+        server.always.lock().unwrap().remove(0);
+        assert!(part("c/long").await.unwrap().is_some());
+        server.fail_always("c/long", Fault::Status(FORBIDDEN));
+        let named = part("a/empty").await.unwrap_err().to_string();
+        assert!(
+            named.contains("run out") && named.contains("a/empty"),
+            "{named}"
+        );
+        server.always.lock().unwrap().clear();
+    }
+}
+
+#[tokio::test]
+async fn where_nobody_guesses_a_forbidden_object_is_an_error() {
+    let server = TestServer::start(conformance::objects()).await;
+    *server.missing.lock().unwrap() = FORBIDDEN;
+    for store in server.stores(patience()) {
+        assert!(matches!(store.read("none", Part::Last(3)).await, Ok(None)));
+        store.stop_guessing();
+        for granted in [false, true] {
+            let error = store.read("none", Part::Last(3)).await.unwrap_err();
+            let named = error.to_string();
+            let is_unclear = matches!(error, ObjectError::Unclear { .. });
+            assert!(
+                is_unclear && !error.is_transient() && named.contains("none"),
+                "{granted}: {named}"
+            );
+            assert!(!error.without_place().contains("http"), "{named}");
+            ten(&*store).await.unwrap();
+        }
+    }
+}
