@@ -3,11 +3,13 @@
 use std::collections::HashMap;
 use std::hash::Hash;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use futures::FutureExt as _;
 use futures::future::{Shared, WeakShared, join_all};
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
+use web_time::Instant;
 
 use crate::maybe_send::{BoxFuture, MaybeSend, MaybeSync};
 
@@ -15,15 +17,28 @@ use crate::maybe_send::{BoxFuture, MaybeSend, MaybeSync};
 pub(crate) trait Weighed {
     /// What it takes \[bytes\].
     fn bytes(&self) -> u64;
+
+    /// Whether it says that there is nothing, which may come yet.
+    fn is_missing(&self) -> bool {
+        false
+    }
+}
+
+/// A value that is kept.
+#[derive(Clone, Debug)]
+struct Kept<V> {
+    value: V,
+    /// Since when, if it is missing.
+    missing: Option<Instant>,
 }
 
 #[derive(Clone, Debug)]
 struct ByBytes;
 
-impl<K, V: Weighed> Weighter<K, V> for ByBytes {
-    fn weight(&self, _: &K, value: &V) -> u64 {
+impl<K, V: Weighed> Weighter<K, Kept<V>> for ByBytes {
+    fn weight(&self, _: &K, kept: &Kept<V>) -> u64 {
         // What the cache itself needs for one.
-        value.bytes() + 64
+        kept.value.bytes() + 64
     }
 }
 
@@ -45,9 +60,10 @@ struct Flying<K, V, E> {
 
 /// Values by key, each made once for all who ask while it is made, and kept within a number of bytes.
 ///
-/// Work goes on while anybody waits for any of its keys, and is dropped with the last.
+/// Work goes on while anybody waits for any of its keys, and is dropped with the last. What is missing is kept for a time.
 pub(crate) struct Flights<K, V, E> {
-    cache: Cache<K, V, ByBytes>,
+    cache: Cache<K, Kept<V>, ByBytes>,
+    missing_for: Duration,
     flying: Mutex<Flying<K, V, E>>,
 }
 
@@ -57,11 +73,12 @@ where
     V: Clone + Weighed + MaybeSend + MaybeSync + 'static,
     E: Clone + MaybeSend + MaybeSync + 'static,
 {
-    /// Keeps values of up to `bytes`, of about `each` bytes each.
-    pub(crate) fn new(bytes: u64, each: u64) -> Arc<Self> {
+    /// Keeps values of up to `bytes`, of about `each` bytes each, and what is missing for so long.
+    pub(crate) fn new(bytes: u64, each: u64, missing_for: Duration) -> Arc<Self> {
         let count = usize::try_from(bytes / each.max(1)).unwrap_or(usize::MAX);
         Arc::new(Self {
             cache: Cache::with_weighter(count.clamp(16, 1 << 16), bytes, ByBytes),
+            missing_for,
             flying: Mutex::new(Flying {
                 next: 0,
                 by_key: HashMap::new(),
@@ -76,7 +93,7 @@ where
         keys: &[K],
         start: impl FnOnce(Vec<K>) -> Vec<(Vec<K>, Work<K, V, E>)>,
     ) -> Vec<Option<Result<V, E>>> {
-        let mut found: Vec<_> = keys.iter().map(|key| self.cache.get(key).map(Ok)).collect();
+        let mut found: Vec<_> = keys.iter().map(|key| self.cached(key).map(Ok)).collect();
         if found.iter().all(Option::is_some) {
             return found;
         }
@@ -105,7 +122,7 @@ where
         for (key, found) in keys.iter().zip(found) {
             // Again: a flight may have landed meanwhile.
             if found.is_none() {
-                *found = self.cache.get(key).map(Ok);
+                *found = self.cached(key).map(Ok);
             }
             if found.is_some() {
                 continue;
@@ -131,11 +148,7 @@ where
             };
             let group: Group<K, V, E> = Box::pin(async move {
                 let done = work.await;
-                for (key, outcome) in &done {
-                    if let Ok(value) = outcome {
-                        landing.flights.cache.insert(*key, value.clone());
-                    }
-                }
+                landing.keep(&done);
                 drop(landing);
                 Arc::new(done)
             });
@@ -147,6 +160,20 @@ where
             waits.push(group);
         }
         waits
+    }
+
+    fn cached(&self, key: &K) -> Option<V> {
+        let kept = self.cache.get(key)?;
+        let is_old = |since: Instant| since.elapsed() >= self.missing_for;
+        { !kept.missing.is_some_and(is_old) }.then_some(kept.value)
+    }
+
+    /// Whoever asks from here on for such a key gets a value whose making has begun later.
+    pub(crate) fn forget(&self, is: impl Fn(&K) -> bool) {
+        let mut flying = self.flying();
+        // Who waits already still gets what is made, which is not kept.
+        flying.by_key.retain(|key, _| !is(key));
+        self.cache.retain(|key, _| !is(key));
     }
 
     /// Keys that are worked on.
@@ -175,6 +202,29 @@ struct Landing<K: Eq + Hash, V, E> {
     keys: Vec<K>,
 }
 
+impl<K, V, E> Landing<K, V, E>
+where
+    K: Copy + Eq + Hash,
+    V: Clone + Weighed,
+{
+    /// Keeps what was made, but for what was forgotten meanwhile.
+    fn keep(&self, done: &Outcomes<K, V, E>) {
+        let flying = self.flights.flying();
+        let made = done
+            .iter()
+            .filter_map(|(key, made)| Some((key, made.as_ref().ok()?)));
+        for (key, value) in made {
+            let flight = flying.by_key.get(key);
+            if flight.is_some_and(|flight| flight.number == self.number) {
+                #[expect(clippy::disallowed_methods, reason = "web_time's, which browsers have")]
+                let missing = value.is_missing().then(Instant::now);
+                let value = value.clone();
+                self.flights.cache.insert(*key, Kept { value, missing });
+            }
+        }
+    }
+}
+
 impl<K: Eq + Hash, V, E> Drop for Landing<K, V, E> {
     fn drop(&mut self) {
         let mut flying = self.flights.flying();
@@ -198,9 +248,15 @@ mod tests {
 
     use super::*;
 
+    const LONG: Duration = Duration::from_secs(1000);
+
     impl Weighed for u64 {
         fn bytes(&self) -> u64 {
             1000
+        }
+
+        fn is_missing(&self) -> bool {
+            *self >= 1000
         }
     }
 
@@ -238,7 +294,7 @@ mod tests {
 
     #[tokio::test]
     async fn each_value_is_made_once_and_errors_are_not_kept() {
-        let numbers: Numbers = Flights::new(1 << 20, 1000);
+        let numbers: Numbers = Flights::new(1 << 20, 1000, LONG);
         let (made, gate) = (Arc::new(AtomicUsize::new(0)), Arc::new(Semaphore::new(0)));
         let readers = (0..8).map(|_| numbers.get(&[4, 5, 6], |keys| gated(keys, &made, &gate)));
         let mut readers = Box::pin(join_all(readers));
@@ -259,7 +315,7 @@ mod tests {
 
     #[tokio::test]
     async fn work_ends_with_its_last_reader() {
-        let numbers: Numbers = Flights::new(1 << 20, 1000);
+        let numbers: Numbers = Flights::new(1 << 20, 1000, LONG);
         let (end, ended) = oneshot::channel::<()>();
         let work = |keys: Vec<u32>| -> Vec<(Vec<u32>, Work<u32, u64, String>)> {
             let never = Box::pin(async move {
@@ -287,8 +343,37 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn what_is_missing_is_kept_for_a_time() {
+        for (kept_for, want) in [(LONG, 2), (Duration::ZERO, 3)] {
+            let numbers: Numbers = Flights::new(1 << 20, 1000, kept_for);
+            let made = Arc::new(AtomicUsize::new(0));
+            for _ in 0..2 {
+                let got = numbers.get(&[2, 1000], |keys| each(keys, &made)).await;
+                assert_eq!(got, [Some(Ok(2)), Some(Ok(1000))]);
+            }
+            assert_eq!(made.load(Ordering::SeqCst), want, "{kept_for:?}");
+        }
+    }
+
+    /// Else what was read before a change would be kept after it.
+    #[tokio::test]
+    async fn what_is_forgotten_while_it_is_made_is_not_kept() {
+        let numbers: Numbers = Flights::new(1 << 20, 1000, LONG);
+        let (made, gate) = (Arc::new(AtomicUsize::new(0)), Arc::new(Semaphore::new(0)));
+        numbers.get(&[8], |keys| each(keys, &made)).await;
+        let mut early = Box::pin(numbers.get(&[2, 4], |keys| gated(keys, &made, &gate)));
+        assert!(futures::poll!(&mut early).is_pending());
+        numbers.forget(|key| *key != 4);
+        gate.add_permits(1000);
+        assert_eq!(early.await, [Some(Ok(2)), Some(Ok(4))]);
+        let before = made.load(Ordering::SeqCst);
+        numbers.get(&[2, 4, 8], |keys| each(keys, &made)).await;
+        assert_eq!(made.load(Ordering::SeqCst), before + 2, "4 is kept");
+    }
+
+    #[tokio::test]
     async fn no_more_is_kept_than_there_is_room_for() {
-        let numbers: Numbers = Flights::new(20_000, 1000);
+        let numbers: Numbers = Flights::new(20_000, 1000, LONG);
         let made = Arc::new(AtomicUsize::new(0));
         for key in 0..200 {
             numbers.get(&[key * 2], |keys| each(keys, &made)).await;

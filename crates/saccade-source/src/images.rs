@@ -1,11 +1,40 @@
 //! Images that other programs wrote, of whichever format is at a place.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::VolumeSource;
 use crate::objects::{Location, LocationError, Objects, Part};
 use crate::precomputed::{PrecomputedError, PrecomputedSource};
 use crate::zarr::{ZarrError, ZarrSource};
+
+/// How an image is read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ImageOptions {
+    /// Whether voxels that are forbidden count as not stored where the store forbids whatever it does not have; otherwise they are
+    /// an error ([`ObjectError::Unclear`](crate::objects::ObjectError::Unclear)).
+    pub forbidden_is_missing: bool,
+    /// What is not stored is not looked for again for so long.
+    pub missing_for: Duration,
+}
+
+impl Default for ImageOptions {
+    fn default() -> Self {
+        Self {
+            forbidden_is_missing: true,
+            missing_for: Duration::from_secs(5),
+        }
+    }
+}
+
+impl ImageOptions {
+    /// To be called between what describes the image, of which much may be missing, and its voxels.
+    pub(crate) fn before_voxels(self, objects: &dyn Objects) {
+        if !self.forbidden_is_missing {
+            objects.stop_guessing();
+        }
+    }
+}
 
 /// An image that is open.
 pub struct OpenImage {
@@ -96,8 +125,20 @@ async fn other(objects: &dyn Objects) -> Option<&'static str> {
 /// [`ImageError::None`] if there is none, [`ImageError::Other`] if there is something else, [`ImageError::Denied`] if nothing may be
 /// read there, others if there is one that cannot be opened.
 pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
+    open_with(location, ImageOptions::default()).await
+}
+
+/// Like [`open`], with options.
+///
+/// # Errors
+///
+/// As [`open`].
+pub async fn open_with(
+    location: &Location,
+    options: ImageOptions,
+) -> Result<OpenImage, ImageError> {
     let (objects, name) = (location.objects()?, location.name());
-    match ZarrSource::open(objects.clone(), &name).await {
+    match ZarrSource::open_with(objects.clone(), &name, options).await {
         Ok(source) => {
             let notes = source.notes().to_vec();
             let source = Arc::new(source);
@@ -106,7 +147,7 @@ pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
         Err(ZarrError::NoImage { .. }) => {}
         Err(error) => return Err(error.into()),
     }
-    match PrecomputedSource::open(objects.clone(), &name).await {
+    match PrecomputedSource::open_with(objects.clone(), &name, options).await {
         Ok(source) => {
             let notes = source.notes().to_vec();
             let source = Arc::new(source);

@@ -35,6 +35,7 @@ use glam::{DVec3, UVec3};
 use saccade_core::brick::MAX_LEVELS;
 use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 
+use crate::images::ImageOptions;
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
 use crate::stored::{Stored, StoredSource, leave_out_zero_shifts, volume_name};
@@ -73,6 +74,19 @@ impl PrecomputedSource {
     ///
     /// [`PrecomputedError::NoVolume`] if they are none, others as they occur.
     pub async fn open(objects: Arc<dyn Objects>, name: &str) -> Result<Self, PrecomputedError> {
+        Self::open_with(objects, name, ImageOptions::default()).await
+    }
+
+    /// Like [`Self::open`], with options.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::open`].
+    pub async fn open_with(
+        objects: Arc<dyn Objects>,
+        name: &str,
+        options: ImageOptions,
+    ) -> Result<Self, PrecomputedError> {
         let read = objects
             .read(
                 "info",
@@ -105,12 +119,14 @@ impl PrecomputedSource {
             let key = format!("{:?}", scale.key);
             notes.extend(scale.placed.note(&key, level.extent));
         }
-        let stored = PrecomputedImage::new(objects, volume, info).await;
+        options.before_voxels(&*objects);
+        let missing_for = options.missing_for;
+        let stored = PrecomputedImage::new(objects, volume, info, missing_for).await;
         let stored = stored.map_err(|source| PrecomputedError::Sample { source })?;
         notes.extend(stored.values().note());
         let piece = stored.piece_bytes();
         Ok(Self {
-            stored: StoredSource::new(stored, piece),
+            stored: StoredSource::new(stored, piece, missing_for),
             notes,
         })
     }

@@ -5,12 +5,14 @@
 
 mod piece;
 mod placed;
+mod replaced;
 mod sample;
 mod watch;
 
 use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use glam::{DVec3, UVec3};
@@ -25,6 +27,7 @@ use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 
 pub(crate) use piece::{ChunkMut, Place, copy, fill};
 pub(crate) use placed::Placed;
+pub(crate) use replaced::{ATTEMPTS, Indexed, Indices, Replaced, is_replaced, never_the_same};
 pub(crate) use sample::{Sample, sampled};
 use watch::Watch;
 
@@ -49,7 +52,7 @@ pub(crate) struct PieceId {
 /// What it holds.
 #[derive(Clone, Debug)]
 pub(crate) enum Piece {
-    /// This value everywhere.
+    /// It is not stored: this value everywhere.
     Uniform(u16),
     /// Values of the volume's type.
     Values(Bytes),
@@ -61,6 +64,10 @@ impl Weighed for Piece {
             Self::Uniform(_) => 0,
             Self::Values(bytes) => bytes.len() as u64,
         }
+    }
+
+    fn is_missing(&self) -> bool {
+        matches!(self, Self::Uniform(_))
     }
 }
 
@@ -126,6 +133,16 @@ pub(crate) trait Stored: MaybeSend + MaybeSync + 'static {
 
     /// Reads pieces, in groups that are best read together.
     fn read(self: &Arc<Self>, pieces: Vec<PieceId>) -> Vec<(Vec<PieceId>, Pieces)>;
+
+    /// The number, within its level, of the object that a piece lies in.
+    fn object(&self, id: PieceId) -> u64 {
+        id.number
+    }
+
+    /// Objects of several pieces that were found to be others than before, since this was asked last.
+    fn take_replaced(&self) -> Vec<Replaced> {
+        Vec::new()
+    }
 }
 
 /// A stored image as a source.
@@ -136,17 +153,17 @@ pub(crate) struct StoredSource<F> {
 }
 
 impl<F: Stored> StoredSource<F> {
-    /// `piece_bytes` is about what a decoded piece takes.
-    pub(crate) fn new(format: F, piece_bytes: u64) -> Self {
-        Self::keeping(format, CACHE_BYTES, piece_bytes)
+    /// `piece_bytes` is about what a decoded piece takes. One that is missing is not looked for again for `missing_for`.
+    pub(crate) fn new(format: F, piece_bytes: u64, missing_for: Duration) -> Self {
+        Self::keeping(format, CACHE_BYTES, piece_bytes, missing_for)
     }
 
     /// The same, with another number of bytes that are kept.
-    fn keeping(format: F, bytes: u64, piece_bytes: u64) -> Self {
+    fn keeping(format: F, bytes: u64, piece_bytes: u64, missing_for: Duration) -> Self {
         Self {
             watch: Watch::new(VoxelBox::of_size(format.volume().extent())),
             format: Arc::new(format),
-            pieces: Flights::new(bytes, piece_bytes),
+            pieces: Flights::new(bytes, piece_bytes, missing_for),
         }
     }
 
@@ -157,16 +174,33 @@ impl<F: Stored> StoredSource<F> {
         places: &[(PieceId, Place)],
         missing: Vec<PieceId>,
     ) -> Vec<(Vec<PieceId>, Pieces)> {
-        let (placed, volume) = (self.format.placed(level), self.format.volume());
-        let voxels = |own: VoxelBox| {
-            let level0 = volume.levels[level as usize].voxels_from_box(placed.whole(own));
-            level0.intersection(VoxelBox::of_size(volume.extent()))
+        let voxels = |(id, place): &(PieceId, Place)| {
+            (*id, whole_voxels(&*self.format, level, place.voxels))
         };
-        let places = places.iter().map(|(id, place)| (*id, voxels(place.voxels)));
+        let places = places.iter().map(voxels);
         let places: Arc<HashMap<PieceId, VoxelBox>> = Arc::new(places.collect());
         let work = self.format.read(missing).into_iter();
-        work.map(|(ids, work)| (ids, self.watch.over(places.clone(), work)))
-            .collect()
+        let watched = work.map(|(ids, work)| {
+            let noticed = self.noticing(work);
+            (ids, self.watch.over(places.clone(), noticed))
+        });
+        watched.collect()
+    }
+
+    /// The same work, after which nothing is kept of objects that it, or another, found replaced, and whoever listens is told.
+    fn noticing(&self, work: Pieces) -> Pieces {
+        let (format, pieces) = (self.format.clone(), self.pieces.clone());
+        let watch = self.watch.clone();
+        Box::pin(async move {
+            let done = work.await;
+            for Replaced { object, voxels } in format.take_replaced() {
+                let is_in = |id: &PieceId| (id.level, format.object(*id)) == object;
+                // Also of this work, which may have read before another found it.
+                pieces.forget(is_in);
+                watch.replaced(is_in, whole_voxels(&*format, object.0, voxels));
+            }
+            done
+        })
     }
 
     async fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
@@ -231,6 +265,13 @@ impl<F: Stored> StoredSource<F> {
             false => Chunk::Voxels(bytes),
         })
     }
+}
+
+/// The level-0 voxels of stored ones of a level.
+fn whole_voxels<F: Stored>(format: &F, level: u32, stored: VoxelBox) -> VoxelBox {
+    let (placed, volume) = (format.placed(level), format.volume());
+    let level0 = volume.levels[level as usize].voxels_from_box(placed.whole(stored));
+    level0.intersection(VoxelBox::of_size(volume.extent()))
 }
 
 /// Whether there is no other byte. Looks at many at a time.

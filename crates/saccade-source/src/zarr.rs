@@ -26,8 +26,9 @@
 //!
 //! # Reading
 //!
-//! A shard's index is read once; chunks that are wanted together and lie close together come with one
-//! request. What is not stored has the array's fill value.
+//! A shard's index is read once, and anew when the shard was replaced, as far as its store tells; chunks that are wanted together and
+//! lie close together come with one request. What is not stored has the array's fill value, and is looked for again when it is read
+//! again a while later ([`ImageOptions::missing_for`]). What has come or was replaced is told by [`VolumeSource::changes`].
 //!
 //! # Failure
 //!
@@ -54,6 +55,7 @@ use saccade_core::brick::MAX_LEVELS;
 use saccade_core::volume::{Dtype, MAX_EXTENT, Volume, VoxelKind};
 use serde_json::Value;
 
+use crate::images::ImageOptions;
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::objects::{Objects, Part};
 use crate::stored::{Stored, StoredSource, leave_out_zero_shifts, volume_name};
@@ -117,6 +119,19 @@ impl ZarrSource {
     ///
     /// [`ZarrError::NoImage`] if they are none, others as they occur.
     pub async fn open(objects: Arc<dyn Objects>, name: &str) -> Result<Self, ZarrError> {
+        Self::open_with(objects, name, ImageOptions::default()).await
+    }
+
+    /// Like [`Self::open`], with options.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::open`].
+    pub async fn open_with(
+        objects: Arc<dyn Objects>,
+        name: &str,
+        options: ImageOptions,
+    ) -> Result<Self, ZarrError> {
         let attributes = attributes(&*objects, "").await?;
         let attributes = attributes.ok_or_else(|| ZarrError::NoImage {
             location: objects.location(""),
@@ -150,11 +165,13 @@ impl ZarrSource {
             let all = labels.join(", ");
             notes.push(format!("it has labels, which are images of their own: {all}; open one as IMAGE/labels/{first}"));
         }
-        let stored = ZarrImage::new(objects, volume, levels, &image).await?;
+        options.before_voxels(&*objects);
+        let missing_for = options.missing_for;
+        let stored = ZarrImage::new(objects, volume, levels, &image, missing_for).await?;
         notes.extend(stored.values().note());
         let piece = stored.piece_bytes();
         Ok(Self {
-            stored: StoredSource::new(stored, piece),
+            stored: StoredSource::new(stored, piece, missing_for),
             notes,
         })
     }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures::StreamExt as _;
@@ -15,10 +16,11 @@ use super::info::{Info, Scale, Sharding};
 use super::shard::{Index, Minishard, compressed_morton, index_range};
 use crate::codecs::Damage;
 use crate::decoding::{self, Decoding, decode};
-use crate::flights::{Flights, Work};
+use crate::flights::Work;
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    Piece, PieceError, PieceId, Pieces, Place, Placed, Sample, Stored, coalesced, sampled,
+    ATTEMPTS, Indexed, Indices, Piece, PieceError, PieceId, Pieces, Place, Placed, Replaced,
+    Sample, Stored, coalesced, is_replaced, never_the_same, sampled,
 };
 use crate::values::Values;
 
@@ -36,7 +38,7 @@ pub(super) struct PrecomputedImage {
     volume: Arc<Volume>,
     info: Info,
     values: Arc<Values>,
-    indices: Arc<Flights<IndexId, Option<Index>, PieceError>>,
+    indices: Indices<IndexId, Index>,
     /// How the first chunk was called that there was.
     names: OnceLock<Name>,
 }
@@ -55,6 +57,7 @@ impl PrecomputedImage {
         objects: Arc<dyn Objects>,
         volume: Volume,
         info: Info,
+        missing_for: Duration,
     ) -> Result<Self, PieceError> {
         let number = info.number;
         let mut image = Self {
@@ -62,7 +65,7 @@ impl PrecomputedImage {
             volume: Arc::new(volume),
             info,
             values: Arc::new(Values::fitted(number, false, None)),
-            indices: Flights::new(INDEX_CACHE, 4096),
+            indices: Indices::new(INDEX_CACHE, 4096, missing_for),
             names: OnceLock::new(),
         };
         let names = { image.info.is_segmentation }.then(|| Values::names(number, false));
@@ -269,11 +272,36 @@ impl PrecomputedImage {
             self.scale(level).key,
             sharding.name(minishard.shard)
         );
-        let index = match self.index(first, *sharding, minishard, &key).await {
-            Ok(Some(index)) => index,
-            Ok(None) => return ids.into_iter().map(|id| (id, Ok(None))).collect(),
-            Err(error) => return ids.into_iter().map(|id| (id, Err(error.clone()))).collect(),
-        };
+        for _ in 0..ATTEMPTS {
+            let index = self.index(first, *sharding, minishard, &key).await;
+            let Indexed { index, version } = match index {
+                Ok(index) => index,
+                Err(error) if is_replaced(&error) => continue,
+                Err(error) => return ids.into_iter().map(|id| (id, Err(error.clone()))).collect(),
+            };
+            let Some(index) = index else {
+                return ids.into_iter().map(|id| (id, Ok(None))).collect();
+            };
+            let read = self.indexed(level, &key, &index, ids.clone(), values).await;
+            // Else its index was of another shard, whether that was noticed by this read or by one beside it.
+            let is_another = |(_, raw): &(_, Raw)| raw.as_ref().is_err_and(is_replaced);
+            if self.objects.replacements(&key) == version && !read.iter().any(is_another) {
+                return read;
+            }
+        }
+        let error = |id| never_the_same(self.which(id), self.objects.location(&key));
+        ids.into_iter().map(|id| (id, Err(error(id)))).collect()
+    }
+
+    /// Chunks of a minishard, by its index.
+    async fn indexed(
+        &self,
+        level: u32,
+        key: &str,
+        index: &Index,
+        ids: Vec<PieceId>,
+        values: Option<&Arc<Values>>,
+    ) -> Vec<(PieceId, Raw)> {
         let most = self.most_encoded(self.scale(level));
         let (mut done, mut wanted, mut ranges) = (Vec::new(), Vec::new(), Vec::new());
         for id in ids {
@@ -283,7 +311,7 @@ impl PrecomputedImage {
                     let length = range.end - range.start;
                     let reason =
                         format!("its index says {length} bytes, and it can need {most} at most");
-                    done.push((id, Err(self.damaged(id, &key, reason))));
+                    done.push((id, Err(self.damaged(id, key, reason))));
                 }
                 Some(range) => {
                     wanted.push(id);
@@ -292,7 +320,7 @@ impl PrecomputedImage {
             }
         }
         let merged = coalesced(&ranges, self.objects.read_cost());
-        let (key, wanted, ranges) = (&key, &wanted, &ranges);
+        let (wanted, ranges) = (&wanted, &ranges);
         let read = async |(span, numbers): (std::ops::Range<u64>, Vec<usize>)| {
             let bytes = self
                 .part(wanted[numbers[0]], key, Part::Range(span.clone()))
@@ -321,19 +349,24 @@ impl PrecomputedImage {
         done
     }
 
-    /// The index of a minishard; `None` if there is nothing in it.
+    /// The index of a minishard; none if there is nothing in it.
     async fn index(
         &self,
         of: PieceId,
         sharding: Sharding,
         minishard: Minishard,
         key: &str,
-    ) -> Result<Option<Index>, PieceError> {
+    ) -> Result<Indexed<Index>, PieceError> {
         let id = (of.level, minishard);
-        let start = |missing: Vec<IndexId>| {
+        let object = Replaced {
+            object: (of.level, minishard.shard),
+            // Its chunks lie wherever the hash puts them.
+            voxels: VoxelBox::of_size(self.scale(of.level).size),
+        };
+        let read = |version| {
             let objects = self.objects.clone();
             let (which, key) = (self.which(of), key.to_owned());
-            let work: Work<IndexId, Option<Index>, PieceError> = Box::pin(async move {
+            let work: Work<IndexId, Indexed<Index>, PieceError> = Box::pin(async move {
                 let damaged = |reason: Damage| PieceError::Damaged {
                     reason,
                     which: which.clone(),
@@ -369,19 +402,27 @@ impl PrecomputedImage {
                 if damaged && objects.is_remote() {
                     index = once().await;
                 }
-                vec![(id, index)]
+                vec![(id, index.map(|index| Indexed { index, version }))]
             });
-            match missing.is_empty() {
-                true => Vec::new(),
-                false => vec![(missing, work)],
-            }
+            work
         };
-        let mut found = self.indices.get(&[id], start).await;
-        found.pop().flatten().unwrap_or(Ok(None))
+        let objects = &*self.objects;
+        self.indices.get(id, objects, key, object, read).await
     }
 }
 
 impl Stored for PrecomputedImage {
+    fn object(&self, id: PieceId) -> u64 {
+        match &self.scale(id.level).sharding {
+            Some(sharding) => sharding.minishard(self.number_in_shards(id)).shard,
+            None => id.number,
+        }
+    }
+
+    fn take_replaced(&self) -> Vec<Replaced> {
+        self.indices.take_replaced()
+    }
+
     fn volume(&self) -> &Arc<Volume> {
         &self.volume
     }

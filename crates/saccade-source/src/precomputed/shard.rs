@@ -119,9 +119,9 @@ pub(super) fn index_range(entry: &[u8], sharding: &Sharding) -> Result<Option<Ra
 #[derive(Clone, Debug)]
 pub(super) struct Index(Vec<(u64, Range<u64>)>);
 
-impl Weighed for Option<Index> {
+impl Weighed for Index {
     fn bytes(&self) -> u64 {
-        self.as_ref().map_or(0, |index| index.0.len() as u64 * 24)
+        self.0.len() as u64 * 24
     }
 }
 

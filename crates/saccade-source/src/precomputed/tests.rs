@@ -1,6 +1,7 @@
 //! Volumes that tensorstore wrote (`fixtures/write.py`), voxel by voxel, and what is not right.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
+mod changing;
 mod hostile;
 
 use std::path::{Path, PathBuf};

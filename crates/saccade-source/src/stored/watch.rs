@@ -1,7 +1,8 @@
 //! Notices that what is stored has changed.
 //!
 //! Nobody tells of changes in files. But what is read again, since there was no room to keep it, may be another than it was: then
-//! those who have kept it elsewhere, under a tag, have to hear of that.
+//! those who have kept it elsewhere, under a tag, have to hear of that. An object of several pieces (a shard) that is found to be
+//! another, or to have come, is told as a whole ([`super::Replaced`]), and nothing is kept of its pieces.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -59,6 +60,13 @@ impl Watch {
         })
     }
 
+    /// Tells that an object of several pieces is another; which of them are, nobody knows.
+    pub(super) fn replaced(&self, is_in: impl Fn(&PieceId) -> bool, voxels: VoxelBox) {
+        self.known.retain(|id, _| !is_in(id));
+        log::info!("voxels were replaced, or came, where the image is kept: {voxels}");
+        self.changes.send_next(voxels, ChangeReason::Tile);
+    }
+
     fn see(&self, id: PieceId, outcome: &Result<Piece, PieceError>, voxels: VoxelBox) {
         // What fails says nothing of what is there.
         let Ok(piece) = outcome else { return };
@@ -89,6 +97,7 @@ fn mark(piece: &Piece) -> u64 {
 #[cfg(test)]
 mod tests {
     use std::sync::Mutex;
+    use std::time::Duration;
 
     use bytes::Bytes;
     use futures::{FutureExt as _, StreamExt as _};
@@ -172,7 +181,7 @@ mod tests {
             pieces: pieces.clone(),
         };
         // Nothing is kept: what there was no room for is read again.
-        let source = StoredSource::keeping(shelf, 0, 1);
+        let source = StoredSource::keeping(shelf, 0, 1, Duration::ZERO);
         let mut changes = source.changes();
         let mut read = |level, x| {
             let id = ChunkId {

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures::StreamExt as _;
@@ -19,10 +20,11 @@ use super::packing::Packing;
 use super::shard::Index;
 use crate::codecs::Damage;
 use crate::decoding::{self, Decoding, decode};
-use crate::flights::{Flights, Work};
+use crate::flights::Work;
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    Piece, PieceError, PieceId, Pieces, Place, Placed, Sample, Stored, coalesced, sampled,
+    ATTEMPTS, Indexed, Indices, Piece, PieceError, PieceId, Pieces, Place, Placed, Replaced,
+    Sample, Stored, coalesced, is_replaced, never_the_same, sampled,
 };
 use crate::values::{Number, Values};
 
@@ -129,6 +131,39 @@ impl LevelArray {
         self.array.number
     }
 
+    /// The shard that a chunk lies in, if there are shards.
+    fn shard(&self, chunk: u64) -> Option<Vec<u64>> {
+        let sharding = self.array.sharding.as_ref()?;
+        let index = unravel(chunk, &self.grid).into_iter();
+        let shard = index.zip(&sharding.chunks).map(|(at, count)| at / count);
+        Some(shard.collect())
+    }
+
+    /// Shards along each axis.
+    fn shards(&self) -> Vec<u64> {
+        let each = self.array.sharding.as_ref().map(|each| &each.chunks[..]);
+        let axes = self.grid.iter().zip(each.unwrap_or_default());
+        axes.map(|(chunks, each)| chunks.div_ceil(*each)).collect()
+    }
+
+    /// Stored voxels of a shard, of all its channels.
+    fn voxels_of_shard(&self, shard: &[u64]) -> VoxelBox {
+        let mut voxels = VoxelBox::of_size(self.extent);
+        let each = self.array.sharding.as_ref().map(|each| &each.chunks[..]);
+        for (n, (axis, each)) in self.axes.iter().zip(each.unwrap_or_default()).enumerate() {
+            if let Axis::Space(axis) = *axis {
+                let edge = |more: u64| {
+                    let edge = (shard[n] + more).saturating_mul(each * self.array.chunk[n]);
+                    u32::try_from(edge)
+                        .unwrap_or(u32::MAX)
+                        .min(self.extent[axis])
+                };
+                (voxels.min[axis], voxels.max[axis]) = (edge(0), edge(1));
+            }
+        }
+        voxels
+    }
+
     /// Chunks that a box of a channel's stored voxels touches: their numbers, and where they have their voxels.
     fn touched(&self, channel: u32, voxels: VoxelBox) -> Vec<(u64, Place)> {
         let mut index = vec![0; self.axes.len()];
@@ -211,7 +246,7 @@ pub(super) struct ZarrImage {
     volume: Arc<Volume>,
     levels: Vec<LevelArray>,
     values: Arc<Values>,
-    indices: Arc<Flights<ShardId, Option<Index>, PieceError>>,
+    indices: Indices<ShardId, Index>,
 }
 
 impl ZarrImage {
@@ -220,6 +255,7 @@ impl ZarrImage {
         volume: Volume,
         levels: Vec<LevelArray>,
         metadata: &Image,
+        missing_for: Duration,
     ) -> Result<Self, ZarrError> {
         // Levels have the same type; in foreign files not always the same order of bytes.
         let finest = &levels[0].array;
@@ -245,7 +281,7 @@ impl ZarrImage {
             volume: Arc::new(volume),
             levels,
             values: Arc::new(Values::fitted(number, big_endian, None)),
-            indices: Flights::new(INDEX_CACHE.max(index * 2), index),
+            indices: Indices::new(INDEX_CACHE.max(index * 2), index, missing_for),
         };
         let names = { metadata.is_labels }.then(|| Values::names(number, big_endian));
         let known = { names.flatten() }.or_else(|| Values::kept(number, big_endian));
@@ -370,7 +406,7 @@ impl ZarrImage {
     ) -> Vec<(PieceId, Raw)> {
         let array = &self.levels[level as usize];
         let most = array.packing.most();
-        let Some(sharding) = &array.array.sharding else {
+        if array.array.sharding.is_none() {
             let one = async |id: PieceId| {
                 let index = unravel(id.number, &array.grid);
                 let key = super::below(&array.path, &array.array.keys.key(&index));
@@ -385,21 +421,44 @@ impl ZarrImage {
                 .buffer_unordered(RANGES_AT_ONCE)
                 .collect()
                 .await;
-        };
+        }
         let Some(&first) = ids.first() else {
             return Vec::new();
         };
-        let index = unravel(first.number, &array.grid);
-        let shard: Vec<u64> = index
-            .iter()
-            .zip(&sharding.chunks)
-            .map(|(at, count)| at / count)
-            .collect();
+        let shard = array.shard(first.number).unwrap_or_default();
         let key = super::below(&array.path, &array.array.keys.key(&shard));
-        let index = match self.index(level, &shard, first, &key).await {
-            Ok(Some(index)) => index,
-            Ok(None) => return ids.into_iter().map(|id| (id, Ok(None))).collect(),
-            Err(error) => return ids.into_iter().map(|id| (id, Err(error.clone()))).collect(),
+        for _ in 0..ATTEMPTS {
+            let Indexed { index, version } = match self.index(level, &shard, first, &key).await {
+                Ok(index) => index,
+                Err(error) if is_replaced(&error) => continue,
+                Err(error) => return ids.into_iter().map(|id| (id, Err(error.clone()))).collect(),
+            };
+            let Some(index) = index else {
+                return ids.into_iter().map(|id| (id, Ok(None))).collect();
+            };
+            let read = self.indexed(array, &key, &index, ids.clone(), values).await;
+            // Else its index was of another shard, whether that was noticed by this read or by one beside it.
+            let is_another = |(_, raw): &(_, Raw)| raw.as_ref().is_err_and(is_replaced);
+            if self.objects.replacements(&key) == version && !read.iter().any(is_another) {
+                return read;
+            }
+        }
+        let error = |id| never_the_same(self.which(id), self.objects.location(&key));
+        ids.into_iter().map(|id| (id, Err(error(id)))).collect()
+    }
+
+    /// Chunks of a shard, by its index.
+    async fn indexed(
+        &self,
+        array: &LevelArray,
+        key: &str,
+        index: &Index,
+        ids: Vec<PieceId>,
+        values: Option<&Arc<Values>>,
+    ) -> Vec<(PieceId, Raw)> {
+        let most = array.packing.most();
+        let Some(sharding) = &array.array.sharding else {
+            return Vec::new();
         };
         let (mut done, mut wanted, mut ranges) = (Vec::new(), Vec::new(), Vec::new());
         for id in ids {
@@ -415,11 +474,11 @@ impl ZarrImage {
                     ranges.push(range);
                 }
                 Ok(None) => done.push((id, Ok(None))),
-                Err(damage) => done.push((id, Err(self.damaged(id, &key, damage)))),
+                Err(damage) => done.push((id, Err(self.damaged(id, key, damage)))),
             }
         }
         let merged = coalesced(&ranges, self.objects.read_cost());
-        let (key, wanted, ranges) = (&key, &wanted, &ranges);
+        let (wanted, ranges) = (&wanted, &ranges);
         let read = async |(span, numbers): (std::ops::Range<u64>, Vec<usize>)| {
             let bytes = self
                 .part(wanted[numbers[0]], key, Part::Range(span.clone()))
@@ -451,28 +510,30 @@ impl ZarrImage {
         done
     }
 
-    /// The index of a shard; `None` if there is no such shard.
+    /// The index of a shard; none if there is no such shard.
     async fn index(
         &self,
         level: u32,
         shard: &[u64],
         of: PieceId,
         key: &str,
-    ) -> Result<Option<Index>, PieceError> {
-        let array = self.levels[level as usize].array.clone();
-        let Some(sharding) = array.sharding.clone() else {
-            return Ok(None);
+    ) -> Result<Indexed<Index>, PieceError> {
+        let array = &self.levels[level as usize];
+        let Some(sharding) = array.array.sharding.clone() else {
+            return Ok(Indexed {
+                index: None,
+                version: 0,
+            });
         };
-        let shards = self.levels[level as usize]
-            .grid
-            .iter()
-            .zip(&sharding.chunks);
-        let shards: Vec<u64> = shards.map(|(chunks, per)| chunks.div_ceil(*per)).collect();
-        let id = (level, ravel(shard, &shards));
-        let start = |missing: Vec<ShardId>| {
-            let objects = self.objects.clone();
+        let id = (level, ravel(shard, &array.shards()));
+        let object = Replaced {
+            object: id,
+            voxels: array.voxels_of_shard(shard),
+        };
+        let read = |version| {
+            let (objects, sharding) = (self.objects.clone(), sharding.clone());
             let (which, key) = (self.which(of), key.to_owned());
-            let work: Work<ShardId, Option<Index>, PieceError> = Box::pin(async move {
+            let work: Work<ShardId, Indexed<Index>, PieceError> = Box::pin(async move {
                 let length = sharding.index_bytes();
                 let part = match sharding.index_at_start {
                     true => Part::Range(0..length),
@@ -501,19 +562,28 @@ impl ZarrImage {
                         }
                     }
                 };
-                vec![(id, index)]
+                vec![(id, index.map(|index| Indexed { index, version }))]
             });
-            match missing.is_empty() {
-                true => Vec::new(),
-                false => vec![(missing, work)],
-            }
+            work
         };
-        let mut found = self.indices.get(&[id], start).await;
-        found.pop().flatten().unwrap_or(Ok(None))
+        let objects = &*self.objects;
+        self.indices.get(id, objects, key, object, read).await
     }
 }
 
 impl Stored for ZarrImage {
+    fn object(&self, id: PieceId) -> u64 {
+        let array = &self.levels[id.level as usize];
+        match array.shard(id.number) {
+            Some(shard) => ravel(&shard, &array.shards()),
+            None => id.number,
+        }
+    }
+
+    fn take_replaced(&self) -> Vec<Replaced> {
+        self.indices.take_replaced()
+    }
+
     fn volume(&self) -> &Arc<Volume> {
         &self.volume
     }
@@ -539,12 +609,8 @@ impl Stored for ZarrImage {
         let mut groups: BTreeMap<(u32, Vec<u64>), Vec<PieceId>> = BTreeMap::new();
         for id in pieces {
             let level = &self.levels[id.level as usize];
-            let mut group = unravel(id.number, &level.grid);
-            if let Some(sharding) = &level.array.sharding {
-                for (at, count) in group.iter_mut().zip(&sharding.chunks) {
-                    *at /= count;
-                }
-            }
+            let alone = || unravel(id.number, &level.grid);
+            let group = level.shard(id.number).unwrap_or_else(alone);
             groups.entry((id.level, group)).or_default().push(id);
         }
         let groups = groups.into_iter().map(|((level, _), ids)| {

@@ -15,9 +15,9 @@ pub(super) struct Index {
     big_endian: bool,
 }
 
-impl Weighed for Option<Index> {
+impl Weighed for Index {
     fn bytes(&self) -> u64 {
-        self.as_ref().map_or(0, |index| index.bytes.len() as u64)
+        self.bytes.len() as u64
     }
 }
 

@@ -1,6 +1,7 @@
 //! Images written by hand, byte by byte, and real ones.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
+mod changing;
 mod hostile;
 mod labels;
 mod places;

@@ -7,7 +7,9 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use bytes::Bytes;
+use futures::{FutureExt as _, StreamExt as _};
 use glam::UVec3;
+use saccade_core::voxel_box::VoxelBox;
 use serde_json::{Value, json};
 
 use super::ZarrSource;
@@ -16,7 +18,7 @@ use crate::objects::{FolderObjects, HttpObjects, Objects, Patience};
 use crate::test_server::{Fault, TestServer};
 use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
 
-fn patience() -> Patience {
+pub(super) fn patience() -> Patience {
     Patience {
         attempts: 3,
         first_wait: Duration::from_millis(5),
@@ -33,14 +35,14 @@ fn sharded() -> Value {
         "codecs": [bytes, zstd], "index_codecs": [bytes, {"name": "crc32c"}], "index_location": "end"}}])
 }
 
-fn blosc() -> Value {
+pub(super) fn blosc() -> Value {
     let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
     json!([bytes, {"name": "blosc", "configuration": {"cname": "zstd", "clevel": 5, "shuffle": "shuffle",
         "typesize": 2, "blocksize": 0}}])
 }
 
 /// A server of an image with these codecs, and the image's values.
-async fn server(shard: [u32; 3], codecs: &Value) -> (Arc<TestServer>, Vec<u16>) {
+pub(super) async fn server(shard: [u32; 3], codecs: &Value) -> (Arc<TestServer>, Vec<u16>) {
     let root = tempfile::tempdir().unwrap();
     let folder = root.path().join("image.zarr");
     let want = write(&folder, "uint16", &version_3("uint16", shard, codecs));
@@ -56,7 +58,7 @@ async fn open_of(objects: Arc<dyn Objects>) -> ZarrSource {
     ZarrSource::open(objects, "image.zarr").await.unwrap()
 }
 
-fn id(x: u32) -> ChunkId {
+pub(super) fn id(x: u32) -> ChunkId {
     ChunkId {
         channel: 0,
         level: 0,
@@ -216,8 +218,28 @@ async fn a_login_that_runs_out_makes_no_holes() {
     }
 }
 
+/// Where the shard of [`raw_image`] is.
+pub(super) const SHARD: &str = "0/c/0/0/0";
+
+/// An image of two chunks in one shard.
+pub(super) fn raw_image(shard: Bytes) -> [(String, Bytes); 3] {
+    let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
+    let array = json!({"zarr_format": 3, "node_type": "array", "shape": [4, 64, 128], "data_type": "uint8",
+        "fill_value": 0, "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [4, 64, 128]}},
+        "chunk_key_encoding": {"name": "default"}, "codecs": [{"name": "sharding_indexed", "configuration": {
+        "chunk_shape": [4, 64, 64], "codecs": [bytes], "index_codecs": [bytes]}}]});
+    let group = json!({"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"multiscales": [{
+        "axes": [{"name": "z"}, {"name": "y"}, {"name": "x"}], "datasets": [{"path": "0"}]}]}}});
+    let objects = [
+        ("zarr.json", group.to_string().into()),
+        ("0/zarr.json", array.to_string().into()),
+        (SHARD, shard),
+    ];
+    objects.map(|(key, bytes)| (key.to_owned(), bytes))
+}
+
 /// Two chunks in a shard, as they are, and in the other order.
-fn raw_shard(values: [u8; 2], swapped: bool) -> Bytes {
+pub(super) fn raw_shard(values: [u8; 2], swapped: bool) -> Bytes {
     const LENGTH: usize = 4 * 64 * 64;
     let mut places = [0, LENGTH as u64];
     let mut shard = values.map(|value| vec![value; LENGTH]);
@@ -236,22 +258,10 @@ fn raw_shard(values: [u8; 2], swapped: bool) -> Bytes {
 /// Nothing of a raw shard tells where its chunks end but its index, which is kept.
 #[tokio::test]
 async fn a_shard_that_is_replaced_is_not_read_by_its_old_index() {
-    let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
-    let array = json!({"zarr_format": 3, "node_type": "array", "shape": [4, 64, 128], "data_type": "uint8",
-        "fill_value": 0, "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [4, 64, 128]}},
-        "chunk_key_encoding": {"name": "default"}, "codecs": [{"name": "sharding_indexed", "configuration": {
-        "chunk_shape": [4, 64, 64], "codecs": [bytes], "index_codecs": [bytes]}}]});
-    let group = json!({"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"multiscales": [{
-        "axes": [{"name": "z"}, {"name": "y"}, {"name": "x"}], "datasets": [{"path": "0"}]}]}}});
-    let shard = "0/c/0/0/0";
-    let objects = [
-        ("zarr.json", group.to_string().into()),
-        ("0/zarr.json", array.to_string().into()),
-        (shard, raw_shard([1, 2], false)),
-    ];
+    let shard = SHARD;
     let folder = tempfile::tempdir().unwrap();
     fs::create_dir_all(folder.path().join("0/c/0/0")).unwrap();
-    let server = TestServer::start(objects.map(|(key, bytes)| (key.to_owned(), bytes))).await;
+    let server = TestServer::start(raw_image(raw_shard([1, 2], false))).await;
     let put = |bytes: Bytes, tag| {
         // Another file in its place, as who writes carefully does it.
         let file = folder.path().join(shard);
@@ -282,21 +292,28 @@ async fn a_shard_that_is_replaced_is_not_read_by_its_old_index() {
                 (2, true) => Arc::new(FolderObjects::new(folder.path())),
                 (way, true) => server.stores(patience())[way].clone(),
             };
-            let source = open_of(store).await;
-            assert_eq!(first(&source.read(id(0)).await.unwrap()), 1);
-            if replaced {
-                put(raw_shard([3, 4], true), "\"two\"");
+            let source = open_of(store.clone()).await;
+            // It shares the store, and its own index is as old.
+            let beside = open_of(store).await;
+            let mut changes = source.changes();
+            let mut told = || changes.next().now_or_never().flatten().map(|c| c.voxels);
+            for one in [&source, &beside] {
+                assert_eq!(first(&one.read(id(0)).await.unwrap()), 1);
             }
-            let got = source.read(id(1)).await;
             if !replaced {
-                assert_eq!(first(&got.unwrap()), 2, "store {n}");
+                assert_eq!(first(&source.read(id(1)).await.unwrap()), 2, "store {n}");
+                assert_eq!(told(), None);
                 continue;
             }
-            let named = told(&got.unwrap_err());
-            assert!(
-                named.contains("replaced") && named.contains(shard),
-                "store {n}: {named}"
-            );
+            put(raw_shard([3, 4], true), "\"two\"");
+            assert_eq!(first(&source.read(id(1)).await.unwrap()), 4, "store {n}");
+            let whole = VoxelBox::of_size(UVec3::new(128, 64, 4));
+            assert_eq!(told(), Some(whole), "store {n}");
+            // Nothing of the old one is kept, and nothing is told twice.
+            assert_eq!(first(&source.read(id(0)).await.unwrap()), 3, "store {n}");
+            assert_eq!(told(), None, "store {n}");
+            assert_eq!(first(&beside.read(id(1)).await.unwrap()), 4, "store {n}");
+            assert_eq!(first(&beside.read(id(0)).await.unwrap()), 3, "store {n}");
         }
     }
 }
