@@ -1,7 +1,6 @@
 //! A volume behind a Saccade server, by HTTP. The same code natively and in browsers.
 
 mod chunks;
-mod client;
 mod event_parser;
 mod events;
 mod ranges;
@@ -23,9 +22,9 @@ use serde::de::DeserializeOwned;
 use crate::changes::Changes;
 use crate::conformance::check_volume;
 use crate::maybe_send::{BoxFuture, BoxStream, sleep, spawn};
+use crate::objects::{Patience, client, is_passing, is_to_be_told};
 use crate::{Change, Chunk, ChunkError, ChunkId, SourceError, ValueRange, VolumeSource};
 use chunks::Revisions;
-use client::client;
 
 pub use status::{Quarantined, Status, StatusReader};
 
@@ -136,6 +135,14 @@ pub enum RemoteError {
 }
 
 impl RemoteError {
+    /// Whether it says nothing of what is there.
+    fn passes(&self) -> bool {
+        match self {
+            Self::Status { status, .. } => is_passing(*status),
+            error => error.is_transient(),
+        }
+    }
+
     /// Whether asking again may help.
     fn is_transient(&self) -> bool {
         match self {
@@ -194,18 +201,46 @@ struct NamedVolume {
     name: String,
 }
 
-/// Names of the volumes a server offers, at its `base` address.
+/// Names of the volumes a server offers, at its `base` address. What passes is asked again, as of objects.
 ///
 /// # Errors
 ///
 /// [`SourceError::Open`] if there is no server or it does not answer as one.
 pub async fn volumes(base: &str) -> Result<Vec<String>, SourceError> {
+    volumes_with(base, Patience::default()).await
+}
+
+/// Like [`volumes`], with other patience.
+///
+/// # Errors
+///
+/// As [`volumes`].
+pub async fn volumes_with(base: &str, patience: Patience) -> Result<Vec<String>, SourceError> {
+    let options = RemoteOptions {
+        idle: patience.idle,
+        ..RemoteOptions::default()
+    };
     let list = async {
         let url = address(base, &["volumes.json"])?;
-        let list: VolumesJson = get_json(&client(), url, RemoteOptions::default()).await?;
-        Ok(list.volumes.into_iter().map(|v| v.name).collect())
+        let client = client();
+        let (mut attempts, mut wait) = (0, patience.first_wait);
+        loop {
+            attempts += 1;
+            match get_json::<VolumesJson>(&client, url.clone(), options).await {
+                Err(error) if error.passes() && attempts < patience.attempts => {
+                    if is_to_be_told() {
+                        log::warn!("trying again: {error}");
+                    }
+                }
+                list => break list,
+            }
+            sleep(wait).await;
+            wait = (wait * 2).min(patience.longest_wait);
+        }
     };
-    list.await.map_err(|error| open_error(error, base))
+    let list: Result<VolumesJson, RemoteError> = list.await;
+    let list = list.map_err(|error| open_error(error, base))?;
+    Ok(list.volumes.into_iter().map(|v| v.name).collect())
 }
 
 impl RemoteSource {

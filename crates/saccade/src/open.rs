@@ -13,11 +13,12 @@ use saccade_archive::{
 };
 use saccade_serve::{CatalogStatus, StatusSource};
 use saccade_source::export;
+use saccade_source::images::{self, ImageOptions};
 use saccade_source::objects::Location;
 use saccade_source::remote::{Quarantined, RemoteError, RemoteSource, Status, volumes};
 use saccade_source::stitched::StitchedSource;
 use saccade_source::zarr::ZarrSource;
-use saccade_source::{Damage, SourceError, VolumeSource, images};
+use saccade_source::{Damage, SourceError, VolumeSource};
 use saccade_view::AcquisitionReader;
 
 use crate::arguments::CatalogArgument;
@@ -168,8 +169,8 @@ fn is_image(folder: &Path) -> bool {
 }
 
 /// Opens an image, and tells what its user should know.
-async fn open_image(location: &Location) -> Result<Arc<dyn VolumeSource>> {
-    let image = images::open(location).await?;
+async fn open_image(location: &Location, options: ImageOptions) -> Result<Arc<dyn VolumeSource>> {
+    let image = images::open_with(location, options).await?;
     for note in &image.notes {
         say(note);
     }
@@ -187,6 +188,21 @@ fn is_no_server(error: &SourceError) -> bool {
     )
 }
 
+/// Whether there is nobody to answer, neither as a server nor with an image.
+fn is_nobody(error: &SourceError) -> bool {
+    let SourceError::Open { source, .. } = error else {
+        return false;
+    };
+    let error = source.downcast_ref::<RemoteError>();
+    matches!(error, Some(RemoteError::Http { source, .. }) if source.is_connect())
+}
+
+/// By what an address failed that gave no answer as a server, and no image.
+fn neither_there(no_server: SourceError, no_image: &anyhow::Error) -> anyhow::Error {
+    let both = format!("no Saccade server answers, and no image opens ({no_image:#})");
+    anyhow::Error::from(no_server).context(both)
+}
+
 /// An open volume, and who knows how its acquisition is coming along.
 pub(crate) struct Opened {
     pub(crate) source: Arc<dyn VolumeSource>,
@@ -201,6 +217,18 @@ impl Place {
         name: Option<&str>,
         stitching: &Stitching,
     ) -> Result<Opened> {
+        let images = ImageOptions::default();
+        self.open_with(catalog, name, stitching, images).await
+    }
+
+    /// The same; an image is read as told.
+    pub(crate) async fn open_with(
+        &self,
+        catalog: &CatalogArgument,
+        name: Option<&str>,
+        stitching: &Stitching,
+        images: ImageOptions,
+    ) -> Result<Opened> {
         match self {
             Self::Address(address) => {
                 ensure!(
@@ -209,10 +237,14 @@ impl Place {
                 );
                 let offered = match volumes(address).await {
                     Ok(offered) => offered,
-                    Err(error) if is_no_server(&error) => {
-                        return Self::image(&address.parse()?, name).await;
+                    Err(error) if is_nobody(&error) => return Err(error.into()),
+                    Err(no_server) => {
+                        let opened = Self::image(&address.parse()?, name, images).await;
+                        return opened.map_err(|error| match is_no_server(&no_server) {
+                            true => error,
+                            false => neither_there(no_server, &error),
+                        });
                     }
-                    Err(error) => return Err(error.into()),
                 };
                 let name = match name {
                     Some(name) => name.to_owned(),
@@ -240,10 +272,10 @@ impl Place {
                     !catalog.is_given(),
                     "an image has no catalog: leave out --catalog"
                 );
-                Self::image(location, name).await
+                Self::image(location, name, images).await
             }
             Self::Bucket(_, location) if !catalog.is_given() => {
-                let opened = Self::image(location, name).await;
+                let opened = Self::image(location, name, images).await;
                 opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for")
             }
             Self::Bucket(storage, _) | Self::Archive(storage) => {
@@ -284,8 +316,12 @@ impl Place {
     }
 
     /// Opens an image, which has the name that is asked for.
-    async fn image(location: &Location, name: Option<&str>) -> Result<Opened> {
-        let source = open_image(location).await?;
+    async fn image(
+        location: &Location,
+        name: Option<&str>,
+        options: ImageOptions,
+    ) -> Result<Opened> {
+        let source = open_image(location, options).await?;
         if let Some(name) = name {
             let own = &source.volume().name;
             ensure!(name == own, "the image is called {own:?}, not {name:?}");
@@ -302,11 +338,12 @@ impl Place {
         &self,
         catalog: &CatalogArgument,
     ) -> Result<Option<Arc<dyn VolumeSource>>> {
+        let images = ImageOptions::default();
         match self {
-            Self::Address(address) => Ok(Some(open_image(&address.parse()?).await?)),
-            Self::Image(location) => Ok(Some(open_image(location).await?)),
+            Self::Address(address) => Ok(Some(open_image(&address.parse()?, images).await?)),
+            Self::Image(location) => Ok(Some(open_image(location, images).await?)),
             Self::Bucket(_, location) if !catalog.is_given() => {
-                let opened = open_image(location).await;
+                let opened = open_image(location, images).await;
                 let opened = opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for");
                 Ok(Some(opened?))
             }

@@ -12,9 +12,11 @@ use glam::{DVec3, UVec3};
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
-use super::{RemoteError, RemoteOptions, RemoteSource};
+use super::{RemoteError, RemoteOptions, RemoteSource, volumes_with};
 use crate::conformance::{check_changes, check_changes_after, check_missed, check_reading};
 use crate::memory::ArraySource;
+use crate::objects::Patience;
+use crate::test_server::TestServer;
 use crate::{ChangeReason, Chunk, ChunkError, ChunkId, SourceError, VolumeSource};
 use server::{Fault, Server, until};
 
@@ -405,5 +407,44 @@ fn what_cannot_be_opened_says_why() {
                 "{base}: {error:?}"
             );
         }
+    });
+}
+
+/// A connection that breaks, and what stalls, say nothing of what is there.
+#[test]
+fn volumes_are_asked_for_with_patience() {
+    run(async {
+        let list = r#"{"volumes": [{"name": "v"}]}"#;
+        let server = TestServer::start([("volumes.json".to_owned(), list.into())]).await;
+        let patience = Patience {
+            attempts: 3,
+            first_wait: Duration::from_millis(5),
+            longest_wait: Duration::from_millis(50),
+            idle: Duration::from_millis(400),
+            slowest: 10_000,
+        };
+        use crate::test_server::Fault;
+        for fault in [
+            Fault::Reset,
+            Fault::Stall,
+            Fault::Cut,
+            Fault::Status("503 Slow Down"),
+        ] {
+            server.fail_next([fault, fault]);
+            let volumes = volumes_with(&server.url, patience).await;
+            assert_eq!(volumes.unwrap(), ["v"], "{fault:?}");
+        }
+        // Others who are named are not asked.
+        let other = TestServer::start([("volumes.json".to_owned(), list.into())]).await;
+        let to = format!("302 Found\r\nlocation: {}/volumes.json", other.url);
+        let before = server.asked("volumes.json");
+        for status in [to.leak(), "404 Not Found"] {
+            server.fail_next([Fault::Status(status)]);
+            let error = volumes_with(&server.url, patience).await.unwrap_err();
+            let named = std::error::Error::source(&error).unwrap().to_string();
+            assert!(named.contains(&status[..3]), "{named}");
+        }
+        assert_eq!(server.asked("volumes.json"), before + 2, "once each");
+        assert_eq!(other.asked(""), 0);
     });
 }

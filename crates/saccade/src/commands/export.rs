@@ -13,6 +13,8 @@ use saccade_archive::storage::Storage;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_source::VolumeSource;
 use saccade_source::export::{ExportError, ExportOptions, ExportProgress, export};
+use saccade_source::images::ImageOptions;
+use saccade_source::objects::ObjectError;
 
 use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
@@ -90,6 +92,11 @@ pub(crate) struct Export {
     #[arg(long)]
     rename_labels: bool,
 
+    /// Take forbidden chunks for missing ones where the image's store forbids whatever it does not have, as public
+    /// buckets do that may not be listed; without it, such an export ends with an error
+    #[arg(long)]
+    forbidden_is_missing: bool,
+
     #[command(flatten)]
     stitching: Stitching,
 }
@@ -97,8 +104,14 @@ pub(crate) struct Export {
 impl Export {
     pub(crate) async fn run(self) -> Result<ExitCode> {
         let volume = self.volume.as_deref();
-        let opened = self.place.open(&self.catalog, volume, &self.stitching);
-        let source = opened.await?.source;
+        let images = ImageOptions {
+            forbidden_is_missing: self.forbidden_is_missing,
+            ..ImageOptions::default()
+        };
+        let opened = self
+            .place
+            .open_with(&self.catalog, volume, &self.stitching, images);
+        let source = opened.await.map_err(hinted)?.source;
         let out = self.out.clone();
         let folder = match &out {
             StorageLocation::Folder(folder) => Some(folder.as_path()),
@@ -106,7 +119,7 @@ impl Export {
         };
         let is_new = folder.is_some_and(|folder| !folder.exists());
         let storage = self.out.open().await?;
-        let done = self.export(&source, &*storage).await;
+        let done = self.export(&source, &*storage).await.map_err(hinted);
         drop(storage);
         if let Some(folder) = folder {
             leave(folder, is_new);
@@ -168,6 +181,20 @@ impl Export {
         };
         say(&summary(&done, bar.elapsed().as_secs_f64()));
         Ok(ExitCode::SUCCESS)
+    }
+}
+
+/// The same, and what to do where nobody knows whether something is forbidden or missing.
+fn hinted(error: anyhow::Error) -> anyhow::Error {
+    let is_unclear = error.chain().any(|cause| {
+        let shared = cause.downcast_ref::<Arc<ObjectError>>().map(|e| &**e);
+        let error = cause.downcast_ref::<ObjectError>().or(shared);
+        matches!(error, Some(ObjectError::Unclear { .. }))
+    });
+    match is_unclear {
+        true => error
+            .context("if what is forbidden is known to be missing, give --forbidden-is-missing"),
+        false => error,
     }
 }
 

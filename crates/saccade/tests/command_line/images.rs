@@ -19,6 +19,10 @@ struct Files {
     files: BTreeMap<String, (String, Vec<u8>)>,
     /// A path whose answer never comes.
     silent: String,
+    /// Where a path begins so, the connection is closed.
+    broken: Option<&'static str>,
+    /// What is answered for other paths, if it is not 404.
+    missing: Option<&'static str>,
     asked: Mutex<Vec<String>>,
 }
 
@@ -65,7 +69,11 @@ impl Files {
                 reader.read_line(&mut line).ok();
                 return None;
             }
-            let missing = ("404 Not Found".to_owned(), Vec::new());
+            if self.broken.is_some_and(|broken| path.starts_with(broken)) {
+                return None;
+            }
+            let missing = self.missing.unwrap_or("404 Not Found");
+            let missing = (missing.to_owned(), Vec::new());
             let (status, body) = self.files.get(&path).unwrap_or(&missing);
             let head = format!(
                 "HTTP/1.1 {status}\r\ncontent-length: {}\r\n\r\n",
@@ -237,6 +245,58 @@ fn an_export_that_is_interrupted_says_so() {
         assert!(!out.join("zarr.json").exists() && out.join("export.json").exists());
         assert!(!out.join(".incoming").exists());
     }
+}
+
+/// Whether a Saccade server is behind an address is asked first; that nobody says so is not the end.
+#[test]
+fn an_image_is_exported_though_nobody_says_that_it_is_no_server() {
+    let mut files = image("127.0.0.1:1");
+    files.files.remove("/data/image.zarr/0/c/2/0/0");
+    files.broken = Some("/data/image.zarr/volumes.json");
+    let (files, address) = files.start();
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out.zarr");
+    let place = format!("http://{address}/data/image.zarr");
+    let exported = run(&["export", &place, text(&out)]);
+    assert!(exported.status.success(), "{}", stderr(&exported));
+    assert!(out.join("zarr.json").exists());
+    let asked = files.asked.lock().unwrap().clone();
+    let probes = asked.iter().filter(|path| path.ends_with("volumes.json"));
+    assert!(probes.count() > 1, "it is asked again");
+    // Where nothing answers, both are told.
+    let mut files = Files::default();
+    files.broken = Some("/");
+    let (_files, address) = files.start();
+    let nothing = run(&[
+        "export",
+        &format!("http://{address}/image.zarr"),
+        text(&out),
+    ]);
+    let parts = [
+        "is the server running",
+        "no image opens",
+        "image.zarr/zarr.json",
+    ];
+    assert_failed(&nothing, 1, &parts);
+}
+
+/// A bucket that may not be listed forbids what it does not have, and a login that fails forbids what it has.
+#[test]
+fn forbidden_chunks_are_exported_as_nothing_only_where_that_is_said() {
+    let mut files = image("127.0.0.1:1");
+    files.files.remove("/data/image.zarr/0/c/2/0/0");
+    files.missing = Some("403 Forbidden");
+    let (_files, address) = files.start();
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out.zarr");
+    let place = format!("http://{address}/data/image.zarr");
+    let refused = run(&["export", &place, text(&out)]);
+    let parts = ["--forbidden-is-missing", "0/c/2/0/0", "access is denied"];
+    assert_failed(&refused, 1, &parts);
+    assert!(!out.join("zarr.json").exists());
+    let exported = run(&["export", &place, text(&out), "--forbidden-is-missing"]);
+    assert!(exported.status.success(), "{}", stderr(&exported));
+    assert!(out.join("zarr.json").exists());
 }
 
 /// An image that should be there by its name is not missed as an archive.

@@ -1,5 +1,0 @@
-use reqwest::Client;
-
-pub(in crate::remote) fn client() -> Client {
-    Client::new()
-}
