@@ -257,17 +257,19 @@ fn an_image_is_exported_though_nobody_says_that_it_is_no_server() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out.zarr");
     let place = format!("http://{address}/data/image.zarr");
-    let exported = run(&["export", &place, text(&out)]);
+    let exported = run(["export", &place, text(&out)]);
     assert!(exported.status.success(), "{}", stderr(&exported));
     assert!(out.join("zarr.json").exists());
     let asked = files.asked.lock().unwrap().clone();
     let probes = asked.iter().filter(|path| path.ends_with("volumes.json"));
     assert!(probes.count() > 1, "it is asked again");
     // Where nothing answers, both are told.
-    let mut files = Files::default();
-    files.broken = Some("/");
+    let files = Files {
+        broken: Some("/"),
+        ..Files::default()
+    };
     let (_files, address) = files.start();
-    let nothing = run(&[
+    let nothing = run([
         "export",
         &format!("http://{address}/image.zarr"),
         text(&out),
@@ -290,11 +292,11 @@ fn forbidden_chunks_are_exported_as_nothing_only_where_that_is_said() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out.zarr");
     let place = format!("http://{address}/data/image.zarr");
-    let refused = run(&["export", &place, text(&out)]);
+    let refused = run(["export", &place, text(&out)]);
     let parts = ["--forbidden-is-missing", "0/c/2/0/0", "access is denied"];
     assert_failed(&refused, 1, &parts);
     assert!(!out.join("zarr.json").exists());
-    let exported = run(&["export", &place, text(&out), "--forbidden-is-missing"]);
+    let exported = run(["export", &place, text(&out), "--forbidden-is-missing"]);
     assert!(exported.status.success(), "{}", stderr(&exported));
     assert!(out.join("zarr.json").exists());
 }
