@@ -44,7 +44,8 @@ pub(crate) async fn piece(
 ) -> Response {
     let mut response = conditional(published, piece, version, headers, patience).await;
     if let Some(id) = published.source.renamed_label() {
-        response.headers_mut().insert(RENAMED_LABEL, id.into());
+        let id = HeaderValue::try_from(id.to_string()).expect("digits");
+        response.headers_mut().insert(RENAMED_LABEL, id);
     }
     response
 }

@@ -18,7 +18,7 @@ use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 
 use crate::codecs::Damage;
-use crate::values::Values;
+use crate::values::{Inside, Values};
 use crate::{precomputed, zarr};
 
 pub(crate) use platform::decode;
@@ -38,17 +38,28 @@ pub(crate) struct Decoding {
     packing: Packing,
     /// Numbers stay as they are stored where this is `None`.
     values: Option<Arc<Values>>,
+    /// Which of them are of the image; all where this is `None`.
+    inside: Option<Inside>,
 }
 
 /// As it is sent.
 #[cfg(any(test, target_family = "wasm"))]
 #[derive(Serialize)]
-struct Sent<'a>(&'a Packing, Option<&'a Values>);
+struct Sent<'a>(&'a Packing, Option<&'a Values>, Option<&'a Inside>);
 
 impl Decoding {
     pub(crate) fn new(packing: Packing, values: Option<&Arc<Values>>) -> Self {
         let values = values.cloned();
-        Self { packing, values }
+        Self {
+            packing,
+            values,
+            inside: None,
+        }
+    }
+
+    /// Of a chunk of which not all is of the image.
+    pub(crate) fn within(self, inside: Option<Inside>) -> Self {
+        Self { inside, ..self }
     }
 
     /// Does it.
@@ -58,7 +69,7 @@ impl Decoding {
             Packing::Precomputed(packing) => packing.unpack(bytes),
         }?;
         Ok(match &self.values {
-            Some(values) => values.convert(numbers),
+            Some(values) => values.convert(numbers, self.inside.as_ref()),
             None => numbers,
         })
     }
@@ -66,7 +77,7 @@ impl Decoding {
     /// For somebody else to do.
     #[cfg(any(test, target_family = "wasm"))]
     pub(crate) fn to_text(&self) -> Result<String, Damage> {
-        let sent = Sent(&self.packing, self.values.as_deref());
+        let sent = Sent(&self.packing, self.values.as_deref(), self.inside.as_ref());
         serde_json::to_string(&sent).map_err(|error| format!("it cannot be handed over: {error}"))
     }
 
@@ -74,10 +85,14 @@ impl Decoding {
     #[cfg(any(test, target_family = "wasm"))]
     pub(crate) fn from_text(text: &str) -> Result<Self, Damage> {
         let read = serde_json::from_str(text);
-        let (packing, values): (Packing, Option<Values>) =
+        let (packing, values, inside): (Packing, Option<Values>, Option<Inside>) =
             read.map_err(|error| format!("it was handed over as something else: {error}"))?;
         let values = values.map(Arc::new);
-        Ok(Self { packing, values })
+        Ok(Self {
+            packing,
+            values,
+            inside,
+        })
     }
 }
 
@@ -89,7 +104,7 @@ mod tests {
     /// A worker does the same as a thread: also with windows that no short decimal number says.
     #[test]
     fn what_is_sent_does_the_same() {
-        let window = Spread {
+        let window = Spread::Real {
             min: -0.1 / 3.0,
             max: f64::from(f32::MAX) / 7.0,
         };
@@ -105,10 +120,16 @@ mod tests {
         let packing = zarr::Packing::new(vec![crate::codecs::Codec::Gzip], stored.len());
         let shades = Values::fitted(Number::F32, true, Some(window));
         let names = Values::names(Number::U32, true).unwrap();
-        for values in [shades, names] {
+        let of_whole =
+            |number, min, max| Values::fitted(number, true, Some(Spread::Whole { min, max }));
+        let wide = of_whole(Number::U64, 1 << 33, u64::MAX.into());
+        let low = of_whole(Number::I64, i64::MIN.into(), i128::from(i64::MIN) + 9);
+        let inside = Inside::new([(10, 7), (100, 100)]);
+        for values in [shades, names, wide, low] {
             let values = Arc::new(values);
             for values in [None, Some(&values)] {
-                let here = Decoding::new(Packing::Zarr(packing.clone()), values);
+                let here =
+                    Decoding::new(Packing::Zarr(packing.clone()), values).within(inside.clone());
                 let text = here.to_text().unwrap();
                 let there = Decoding::from_text(&text).unwrap();
                 assert_eq!(there.to_text().unwrap(), text);

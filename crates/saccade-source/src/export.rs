@@ -161,12 +161,12 @@ pub enum ExportError {
     },
     /// An id of labels has no room in the image that would be written.
     #[error(
-        "the labels have ids such as {id}, which do not fit into the 16 bits of an exported voxel; copy the image as it is, or \
+        "the labels have ids such as {id}, which do not fit into an exported voxel (0 to 65535); copy the image as it is, or \
          let such ids become other numbers, which several may share"
     )]
     Label {
         /// The id.
-        id: u64,
+        id: i128,
     },
     /// Voxels could not be had.
     #[error("cannot read what is to be exported")]

@@ -145,7 +145,7 @@ impl VolumeSource for PrecomputedSource {
         self.stored.read(id)
     }
 
-    fn renamed_label(&self) -> Option<u64> {
+    fn renamed_label(&self) -> Option<i128> {
         self.stored.renamed_label()
     }
 

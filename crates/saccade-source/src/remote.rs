@@ -7,8 +7,7 @@ mod ranges;
 mod since;
 mod status;
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use futures::StreamExt;
@@ -172,8 +171,8 @@ pub struct RemoteSource {
     revisions: Arc<Revisions>,
     /// What the server says of how the volume is shown.
     notes: Vec<String>,
-    /// What the server says of [`RENAMED_LABEL`]; 0 for nothing so far.
-    renamed: AtomicU64,
+    /// What the server says of [`RENAMED_LABEL`], if it does.
+    renamed: OnceLock<i128>,
     events: AbortHandle,
 }
 
@@ -305,7 +304,7 @@ impl RemoteSource {
             changes,
             revisions,
             notes,
-            renamed: AtomicU64::new(0),
+            renamed: OnceLock::new(),
             events,
         })
     }
@@ -355,9 +354,8 @@ impl VolumeSource for RemoteSource {
         Box::pin(self.since(revision))
     }
 
-    fn renamed_label(&self) -> Option<u64> {
-        let id = self.renamed.load(Ordering::Relaxed);
-        (id != 0).then_some(id)
+    fn renamed_label(&self) -> Option<i128> {
+        self.renamed.get().copied()
     }
 
     fn find_value_range(

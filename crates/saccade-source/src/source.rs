@@ -229,8 +229,8 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
     }
 
     /// An id of labels among what was read so far that is another number in the volume, which other ids may share, since
-    /// the volume's type is too narrow for it.
-    fn renamed_label(&self) -> Option<u64> {
+    /// the volume's type is too narrow for it, or has no negative numbers.
+    fn renamed_label(&self) -> Option<i128> {
         None
     }
 

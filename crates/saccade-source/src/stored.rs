@@ -302,7 +302,7 @@ impl<F: Stored> VolumeSource for StoredSource<F> {
         Box::pin(self.chunk(id))
     }
 
-    fn renamed_label(&self) -> Option<u64> {
+    fn renamed_label(&self) -> Option<i128> {
         self.format.values().renamed()
     }
 

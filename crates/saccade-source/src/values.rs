@@ -1,10 +1,17 @@
 //! Numbers of all kinds, and what becomes of them in volumes of 8 and 16 bit.
 
+mod inside;
+mod spread;
+
 use std::fmt;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::OnceLock;
 
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
+
+pub(crate) use inside::Inside;
+use spread::Figure;
+pub(crate) use spread::Spread;
 
 /// How a number is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,31 +55,14 @@ impl Number {
         }
     }
 
+    /// Whether it can be a whole number below 0.
+    fn is_signed(self) -> bool {
+        matches!(self, Self::I8 | Self::I16 | Self::I32 | Self::I64)
+    }
+
     /// Whether it can be a label.
     pub(crate) fn is_whole(self) -> bool {
         !matches!(self, Self::F32 | Self::F64)
-    }
-}
-
-/// Smallest and largest of some numbers.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(from = "[u64; 2]", into = "[u64; 2]")]
-pub(crate) struct Spread {
-    pub(crate) min: f64,
-    pub(crate) max: f64,
-}
-
-/// By their bits: decimal digits may say neighbours.
-impl From<[u64; 2]> for Spread {
-    fn from(bits: [u64; 2]) -> Self {
-        let [min, max] = bits.map(f64::from_bits);
-        Self { min, max }
-    }
-}
-
-impl From<Spread> for [u64; 2] {
-    fn from(Spread { min, max }: Spread) -> Self {
-        [min, max].map(f64::to_bits)
     }
 }
 
@@ -82,7 +72,7 @@ enum Way {
     /// They are what they are; signed ones are moved up by half their range.
     Kept,
     /// Whole numbers less this one.
-    Less(i64),
+    Less(i128),
     /// From this window to 1 to 65535.
     Window(Spread),
     /// Names of things, of which only sameness matters: what they are up to 65535, scattered over 1 to 65535 beyond.
@@ -95,11 +85,40 @@ pub(crate) struct Values {
     number: Number,
     big_endian: bool,
     way: Way,
+    /// A number that was met and is not shown as what it is: one beyond the others, or a name that is another.
     #[serde(skip)]
-    told: AtomicBool,
-    /// A name that was met and is shown as another number; 0 for none.
-    #[serde(skip)]
-    renamed: AtomicU64,
+    met: OnceLock<Figure>,
+}
+
+/// A stored number as it is shown, and whether that says something else than it does.
+type Shown = (u16, bool);
+
+/// Whole numbers of up to 64 bit, in their order from 0 on.
+trait Ordered: Copy {
+    /// What 0 is.
+    const ZERO: u64;
+
+    fn ordered(self) -> u64;
+
+    fn exact(self) -> i128 {
+        i128::from(self.ordered()) - i128::from(Self::ZERO)
+    }
+}
+
+impl Ordered for u64 {
+    const ZERO: Self = 0;
+
+    fn ordered(self) -> u64 {
+        self
+    }
+}
+
+impl Ordered for i64 {
+    const ZERO: u64 = 1 << 63;
+
+    fn ordered(self) -> u64 {
+        self.cast_unsigned() ^ Self::ZERO
+    }
 }
 
 impl Values {
@@ -115,20 +134,26 @@ impl Values {
 
     /// Those of wide numbers, of which a sample has this spread.
     pub(crate) fn fitted(number: Number, big_endian: bool, spread: Option<Spread>) -> Self {
-        let spread = spread.unwrap_or(Spread { min: 0.0, max: 1.0 });
-        let Spread { min, max } = spread;
-        let way = if !number.is_whole() {
-            let max = if max > min { max } else { min + 1.0 };
-            Way::Window(Spread { min, max })
-        } else if min >= 0.0 && max <= f64::from(u16::MAX) {
-            Way::Less(0)
-        } else if max - min < f64::from(u16::MAX) && min.abs() < 2_f64.powi(52) {
-            // Whole, and below 2^52.
-            #[expect(clippy::cast_possible_truncation, reason = "checked in the line above")]
-            let less = min as i64 - 1;
-            Way::Less(less)
-        } else {
-            Way::Window(spread)
+        let spread = spread.unwrap_or(match number.is_whole() {
+            true => Spread::Whole { min: 0, max: 1 },
+            false => Spread::Real { min: 0.0, max: 1.0 },
+        });
+        let most = i128::from(u16::MAX);
+        let way = match spread {
+            Spread::Whole { min, max } if min >= 0 && max <= most => Way::Less(0),
+            Spread::Whole { min, max } if max - min < most => Way::Less(min - 1),
+            Spread::Real { min, max } if max <= min => {
+                // A window has some width, also where numbers are so large that 1 is none.
+                let room = (min.abs() * 1e-9).max(1.0);
+                Way::Window(match min + room {
+                    max if max.is_finite() => Spread::Real { min, max },
+                    _ => Spread::Real {
+                        min: min - room,
+                        max: min,
+                    },
+                })
+            }
+            spread => Way::Window(spread),
         };
         Self::new(number, big_endian, way)
     }
@@ -138,28 +163,33 @@ impl Values {
             number,
             big_endian,
             way,
-            told: AtomicBool::new(false),
-            renamed: AtomicU64::new(0),
+            met: OnceLock::new(),
         }
     }
 
     /// A name that is shown as another number, if one was met.
-    pub(crate) fn renamed(&self) -> Option<u64> {
-        let name = self.renamed.load(Ordering::Relaxed);
-        (name != 0).then_some(name)
+    pub(crate) fn renamed(&self) -> Option<i128> {
+        match (self.way, self.met.get()) {
+            (Way::Names, Some(Figure::Whole(name))) => Some(*name),
+            _ => None,
+        }
     }
 
     /// Where a value of the volume comes from, as a line: the number times the first plus the second. Means nothing of names.
     pub(crate) fn scale(&self) -> (f64, f64) {
+        let line = |min: f64, half: f64| {
+            let factor = 32_767.0 / half;
+            (factor, 1.0 - min * factor)
+        };
         match (self.way, self.number) {
             (Way::Kept, Number::I8) => (1.0, 128.0),
             (Way::Kept, Number::I16) => (1.0, 32_768.0),
             (Way::Kept | Way::Names, _) => (1.0, 0.0),
             (Way::Less(less), _) => (1.0, -(less as f64)),
-            (Way::Window(Spread { min, max }), _) => {
-                let factor = 65_534.0 / (max - min);
-                (factor, 1.0 - min * factor)
+            (Way::Window(Spread::Whole { min, max }), _) => {
+                line(min as f64, (max - min) as f64 / 2.0)
             }
+            (Way::Window(Spread::Real { min, max }), _) => line(min, max / 2.0 - min / 2.0),
         }
     }
 
@@ -182,20 +212,30 @@ impl Values {
             Way::Less(less) => Some(format!(
                 "its values are {number}; they are shown in 16 bit less {less}, which loses nothing of those looked at"
             )),
-            Way::Window(Spread { min, max }) => {
-                let none = match number.is_whole() {
-                    true => "",
-                    false => ", and what is no number (NaN) as nothing measured",
+            Way::Window(spread) => {
+                let (min, max, none) = match spread {
+                    Spread::Whole { min, max } => (Figure::Whole(min), Figure::Whole(max), ""),
+                    Spread::Real { min, max } => (
+                        Figure::Real(min),
+                        Figure::Real(max),
+                        ", and what is no number (NaN) as nothing measured",
+                    ),
                 };
                 Some(format!(
                     "its values are {number}; those from {min} to {max} are shown in 65535 steps, what lies beyond as the ends{none}"
                 ))
             }
             Way::Names if number.bytes() <= 2 => None,
-            Way::Names => Some(format!(
-                "its values are names of things ({number}); up to 65535 they are shown as they are, each larger one as one of \
-                 65535 numbers, which different things may share"
-            )),
+            Way::Names => {
+                let negative = match number.is_signed() {
+                    true => ", and each negative one,",
+                    false => "",
+                };
+                Some(format!(
+                    "its values are names of things ({number}); up to 65535 they are shown as they are, each larger one{negative} as \
+                     one of 65535 numbers, which different things may share"
+                ))
+            }
         }
     }
 
@@ -204,7 +244,7 @@ impl Values {
         if matches!(self.way, Way::Window(_)) && fill.iter().all(|&byte| byte == 0) {
             return 0;
         }
-        let value = self.convert(Bytes::copy_from_slice(fill));
+        let value = self.convert(Bytes::copy_from_slice(fill), None);
         match *value {
             [low] => low.into(),
             [low, high, ..] => u16::from_le_bytes([low, high]),
@@ -212,150 +252,234 @@ impl Values {
         }
     }
 
-    /// Bytes that hold these values, from those of numbers.
-    pub(crate) fn convert(&self, stored: Bytes) -> Bytes {
+    /// Bytes that hold these values, from those of a chunk's numbers, of which these are inside of the image; all without a word.
+    pub(crate) fn convert(&self, stored: Bytes, inside: Option<&Inside>) -> Bytes {
+        let chunk = Stored {
+            values: self,
+            bytes: &stored,
+            inside,
+        };
         match (self.number, self.way) {
-            (Number::U8, _) | (Number::I8, Way::Names) => stored,
+            (Number::U8, _) => stored,
+            (Number::I8, Way::Names) => {
+                chunk.judge(
+                    i8::from_le_bytes,
+                    |name| name < 0,
+                    |name| Figure::Whole(name.into()),
+                );
+                stored
+            }
             (Number::I8, _) => stored.iter().map(|byte| byte ^ 0x80).collect(),
             (Number::U16, _) if !self.big_endian => stored,
-            (Number::U16, _) => self.of(&stored, u16::from_le_bytes, |value| value),
-            // Whatever the sign: other names, and 0 is nothing.
-            (Number::I16, Way::Names) => self.of(&stored, u16::from_le_bytes, |value| value),
-            (Number::I16, _) => self.of(&stored, i16::from_le_bytes, |value| {
-                value.cast_unsigned() ^ 0x8000
-            }),
-            (Number::U32, _) => self.of(&stored, u32::from_le_bytes, |v| {
-                self.whole(v.into(), v.into())
-            }),
-            (Number::I32, _) => self.of(&stored, i32::from_le_bytes, |v| {
-                self.whole(v.into(), i64::from(v).cast_unsigned())
-            }),
-            (Number::U64, _) => self.of(&stored, u64::from_le_bytes, |v| {
-                self.whole(i64::try_from(v).unwrap_or(i64::MAX), v)
-            }),
-            (Number::I64, _) => self.of(&stored, i64::from_le_bytes, |v| {
-                self.whole(v, v.cast_unsigned())
-            }),
-            (Number::F32, _) => self.of(&stored, f32::from_le_bytes, |v| self.windowed(v.into())),
-            (Number::F64, _) => self.of(&stored, f64::from_le_bytes, |v| self.windowed(v)),
+            (Number::U16, _) => chunk.each(
+                u16::from_le_bytes,
+                |value| (value, false),
+                |value| Figure::Whole(value.into()),
+            ),
+            // Negative ones become other names: 0 is nothing, and the others are what they are.
+            (Number::I16, Way::Names) => chunk.each(
+                i16::from_le_bytes,
+                |value| (value.cast_unsigned(), value < 0),
+                |value| Figure::Whole(value.into()),
+            ),
+            (Number::I16, _) => chunk.each(
+                i16::from_le_bytes,
+                |value| (value.cast_unsigned() ^ 0x8000, false),
+                |value| Figure::Whole(value.into()),
+            ),
+            (Number::U32, _) => chunk.whole(|bytes| u64::from(u32::from_le_bytes(bytes))),
+            (Number::I32, _) => chunk.whole(|bytes| i64::from(i32::from_le_bytes(bytes))),
+            (Number::U64, _) => chunk.whole(u64::from_le_bytes),
+            (Number::I64, _) => chunk.whole(i64::from_le_bytes),
+            (Number::F32, _) => chunk.real(|bytes| f64::from(f32::from_le_bytes(bytes))),
+            (Number::F64, _) => chunk.real(f64::from_le_bytes),
         }
     }
 
-    fn of<T, const N: usize>(
+    /// Tells, once, that a number is not shown as what it is.
+    fn beyond(&self, number: Figure) {
+        if self.met.set(number).is_err() {
+            return;
+        }
+        match self.way {
+            // Of wide ones it is told when the image is opened.
+            Way::Names if self.number.bytes() > 2 => {}
+            Way::Names => log::warn!(
+                "the labels have negative ids such as {number}; each is shown as another number"
+            ),
+            _ => log::warn!(
+                "the image has values such as {number} that lie beyond those that were looked at when it \
+                 was opened; they are shown as the nearest that can be shown"
+            ),
+        }
+    }
+}
+
+/// Numbers of a chunk that become values.
+struct Stored<'a> {
+    values: &'a Values,
+    bytes: &'a [u8],
+    inside: Option<&'a Inside>,
+}
+
+impl Stored<'_> {
+    /// One after the other, by how it is shown. Of those that are shown as something else, one inside of the image is told.
+    fn each<T: Copy, const N: usize>(
         &self,
-        stored: &[u8],
-        number: fn([u8; N]) -> T,
-        value: impl Fn(T) -> u16,
+        number: impl Fn([u8; N]) -> T,
+        shown: impl Fn(T) -> Shown,
+        figure: impl Fn(T) -> Figure,
     ) -> Bytes {
-        let mut bytes = Vec::with_capacity(stored.len() / N * 2);
-        for stored in stored.as_chunks::<N>().0 {
-            let mut stored = *stored;
-            if self.big_endian {
-                stored.reverse();
-            }
-            bytes.extend(value(number(stored)).to_le_bytes());
+        let mut bytes = Vec::with_capacity(self.bytes.len() / N * 2);
+        let mut any = false;
+        for stored in self.bytes.as_chunks::<N>().0 {
+            let (value, other) = shown(number(self.native(*stored)));
+            any |= other;
+            bytes.extend(value.to_le_bytes());
+        }
+        if any {
+            self.judge(number, |number| shown(number).1, figure);
         }
         bytes.into()
     }
 
-    fn whole(&self, value: i64, name: u64) -> u16 {
-        match self.way {
-            Way::Kept | Way::Less(_) => {
-                let less = if let Way::Less(less) = self.way {
-                    less
-                } else {
-                    0
-                };
-                let shown = value.saturating_sub(less);
-                let cut = shown.clamp(0, u16::MAX.into());
-                if cut != shown {
-                    self.beyond(value as f64);
-                }
-                u16::try_from(cut).expect("cut to its range")
-            }
-            Way::Window(_) => self.windowed(value as f64),
-            Way::Names => u16::try_from(name).unwrap_or_else(|_| {
-                self.renamed.store(name, Ordering::Relaxed);
-                // Fibonacci hashing: neighbours in number are far apart.
-                let mixed = (name ^ (name >> 32)).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
-                u16::try_from(1 + mixed % 65_535).expect("at most 65535")
-            }),
+    /// Tells of a number inside of the image of which this holds, if none was told of before.
+    fn judge<T: Copy, const N: usize>(
+        &self,
+        number: impl Fn([u8; N]) -> T,
+        is_other: impl Fn(T) -> bool,
+        figure: impl Fn(T) -> Figure,
+    ) {
+        if self.values.met.get().is_some() {
+            return;
         }
-    }
-
-    fn windowed(&self, value: f64) -> u16 {
-        let Way::Window(Spread { min, max }) = self.way else {
-            return 0;
+        let stored = self.bytes.as_chunks::<N>().0;
+        let find = |stored: &[[u8; N]]| {
+            let mut numbers = stored.iter().map(|stored| number(self.native(*stored)));
+            numbers.find(|number| is_other(*number))
         };
-        // What is no number was not measured, and zeros before everything that was are padding.
-        if value.is_nan() || (value == 0.0 && min > 0.0) {
-            return 0;
-        }
-        if value < min || value > max {
-            self.beyond(value);
-        }
-        let share = ((value - min) / (max - min)).clamp(0.0, 1.0);
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "from 1 to 65535"
-        )]
-        let shown = 1 + (share * 65_534.0).round() as u16;
-        shown
-    }
-
-    /// Tells, once, that a value is not shown as what it is.
-    fn beyond(&self, value: f64) {
-        if !self.told.swap(true, Ordering::Relaxed) {
-            log::warn!(
-                "the image has values such as {value} that lie beyond those that were looked at when it \
-                        was opened; they are shown as the nearest that can be shown"
-            );
+        let found = match self.inside {
+            None => find(stored),
+            Some(inside) => inside.runs().find_map(|run| find(stored.get(run)?)),
+        };
+        if let Some(number) = found {
+            self.values.beyond(figure(number));
         }
     }
 
-    /// Spread of stored numbers, without those that are none.
-    pub(crate) fn spread(number: Number, big_endian: bool, stored: &[u8]) -> Option<Spread> {
-        fn of<T, const N: usize>(
-            stored: &[u8],
-            swap: bool,
-            number: fn([u8; N]) -> T,
-            to: fn(T) -> f64,
-        ) -> Option<Spread> {
-            let mut spread: Option<Spread> = None;
-            for stored in stored.as_chunks::<N>().0 {
-                let mut stored = *stored;
-                if swap {
-                    stored.reverse();
-                }
-                let value = to(number(stored));
-                if value.is_finite() {
-                    let Spread { min, max } = spread.unwrap_or(Spread {
-                        min: value,
-                        max: value,
-                    });
-                    spread = Some(Spread {
-                        min: min.min(value),
-                        max: max.max(value),
-                    });
-                }
+    /// With the low byte first.
+    fn native<const N: usize>(&self, mut stored: [u8; N]) -> [u8; N] {
+        if self.values.big_endian {
+            stored.reverse();
+        }
+        stored
+    }
+
+    fn whole<T: Ordered, const N: usize>(&self, number: impl Fn([u8; N]) -> T) -> Bytes {
+        let figure = |number: T| Figure::Whole(number.exact());
+        // Within the type, as it was seen there.
+        let place = |number: i128| {
+            let place = number + i128::from(T::ZERO);
+            u64::try_from(place.clamp(0, u64::MAX.into())).expect("cut to its range")
+        };
+        match self.values.way {
+            Way::Names => self.each(
+                number,
+                |number| {
+                    let name = number.ordered() ^ T::ZERO;
+                    match u16::try_from(name) {
+                        Ok(name) => (name, false),
+                        Err(_) => (scattered(name), true),
+                    }
+                },
+                figure,
+            ),
+            Way::Window(Spread::Whole { min, max }) => {
+                let (low, high) = (place(min), place(max));
+                let span = (high - low) as f64;
+                let is_padding = |place| place == T::ZERO && min > 0;
+                self.each(
+                    number,
+                    |number| {
+                        let place = number.ordered();
+                        if is_padding(place) {
+                            return (0, false);
+                        }
+                        // Exactly how far up it lies, and then which share of the whole way that is.
+                        let up = place.clamp(low, high) - low;
+                        (step(up as f64 / span), place < low || place > high)
+                    },
+                    figure,
+                )
             }
-            spread
-        }
-        let swap = big_endian;
-        match number {
-            Number::U8 => of(stored, swap, u8::from_le_bytes, f64::from),
-            Number::I8 => of(stored, swap, i8::from_le_bytes, f64::from),
-            Number::U16 => of(stored, swap, u16::from_le_bytes, f64::from),
-            Number::I16 => of(stored, swap, i16::from_le_bytes, f64::from),
-            Number::U32 => of(stored, swap, u32::from_le_bytes, f64::from),
-            Number::I32 => of(stored, swap, i32::from_le_bytes, f64::from),
-            Number::U64 => of(stored, swap, u64::from_le_bytes, |v| v as f64),
-            Number::I64 => of(stored, swap, i64::from_le_bytes, |v| v as f64),
-            Number::F32 => of(stored, swap, f32::from_le_bytes, f64::from),
-            Number::F64 => of(stored, swap, f64::from_le_bytes, |v| v),
+            Way::Kept | Way::Less(_) | Way::Window(Spread::Real { .. }) => {
+                let less = match self.values.way {
+                    Way::Less(less) => less,
+                    _ => 0,
+                };
+                // The least that is shown, and as what.
+                let (low, first) = match less {
+                    0 => (T::ZERO, 0),
+                    less => (place(less + 1), 1),
+                };
+                let is_padding = |place| place == T::ZERO && less > 0;
+                self.each(
+                    number,
+                    |number| {
+                        let place = number.ordered();
+                        match place.checked_sub(low) {
+                            Some(up) => match u16::try_from(up.saturating_add(first)) {
+                                Ok(value) => (value, false),
+                                Err(_) => (u16::MAX, true),
+                            },
+                            None => (0, !is_padding(place)),
+                        }
+                    },
+                    figure,
+                )
+            }
         }
     }
+
+    fn real<const N: usize>(&self, number: impl Fn([u8; N]) -> f64) -> Bytes {
+        let (min, max) = match self.values.way {
+            Way::Window(Spread::Real { min, max }) => (min, max),
+            _ => (0.0, 1.0),
+        };
+        let shown = |value: f64, share: f64| {
+            // What is no number was not measured, and zeros before everything that was are padding.
+            if value.is_nan() || (value == 0.0 && min > 0.0) {
+                return (0, false);
+            }
+            (step(share), value < min || value > max)
+        };
+        let span = max - min;
+        if span.is_finite() {
+            let shown = |value| shown(value, (value - min) / span);
+            return self.each(number, shown, Figure::Real);
+        }
+        // From the least to the largest it is further than any number is large.
+        let (low, span) = (min / 2.0, max / 2.0 - min / 2.0);
+        let shown = |value| shown(value, (value / 2.0 - low) / span);
+        self.each(number, shown, Figure::Real)
+    }
+}
+
+/// The step of 1 to 65535 at this share of the way.
+fn step(share: f64) -> u16 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "from 1 to 65535"
+    )]
+    let shown = 1 + (share.clamp(0.0, 1.0) * 65_534.0).round() as u16;
+    shown
+}
+
+/// A number of 1 to 65535 for a name. Fibonacci hashing: neighbours in number are far apart.
+fn scattered(name: u64) -> u16 {
+    let mixed = (name ^ (name >> 32)).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
+    u16::try_from(1 + mixed % 65_535).expect("at most 65535")
 }
 
 impl fmt::Display for Number {
@@ -375,119 +499,5 @@ impl fmt::Display for Number {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn shown(values: &Values, stored: impl IntoIterator<Item = Vec<u8>>) -> Vec<u16> {
-        let stored: Vec<u8> = stored.into_iter().flatten().collect();
-        let bytes = values.convert(stored.into());
-        bytes
-            .as_chunks()
-            .0
-            .iter()
-            .map(|two| u16::from_le_bytes(*two))
-            .collect()
-    }
-
-    fn fitted(number: Number, min: f64, max: f64) -> Values {
-        Values::fitted(number, false, Some(Spread { min, max }))
-    }
-
-    #[test]
-    fn whole_numbers_that_fit_stay_what_they_are() {
-        let u32s = |v: &[u32]| {
-            v.iter()
-                .map(|v| v.to_le_bytes().to_vec())
-                .collect::<Vec<_>>()
-        };
-        let values = fitted(Number::U32, 0.0, 40_000.0);
-        assert_eq!(
-            shown(&values, u32s(&[0, 1, 40_000, 65_535, 70_000])),
-            [0, 1, 40_000, 65_535, 65_535]
-        );
-        // Far from 0, but close together: nothing is lost.
-        let values = fitted(Number::U32, 1_000_000.0, 1_065_000.0);
-        assert_eq!(
-            shown(&values, u32s(&[1_000_000, 1_000_001, 1_065_000])),
-            [1, 2, 65_001]
-        );
-        assert_eq!(values.scale(), (1.0, -999_999.0));
-        let i32s = [-5_i32, 0, 7].map(|v| v.to_be_bytes().to_vec());
-        let spread = Values::spread(Number::I32, true, &i32s.concat());
-        assert_eq!(
-            spread,
-            Some(Spread {
-                min: -5.0,
-                max: 7.0
-            })
-        );
-        let values = Values::fitted(Number::I32, true, spread);
-        assert_eq!(shown(&values, i32s), [1, 6, 13]);
-    }
-
-    #[test]
-    fn what_does_not_fit_gets_a_window_and_is_told() {
-        let f32s = [f32::NAN, -3.0, -1.0, 0.0, 3.0, 9.0].map(|v| v.to_le_bytes().to_vec());
-        let values = fitted(Number::F32, -1.0, 3.0);
-        assert_eq!(shown(&values, f32s), [0, 1, 1, 16_385, 65_535, 65_535]);
-        let (factor, shift) = values.scale();
-        assert!((3.0 * factor + shift - 65_535.0).abs() < 1e-6);
-        let note = values.note().unwrap();
-        assert!(
-            note.contains("float32") && note.contains("-1 to 3") && note.contains("(NaN)"),
-            "{note}"
-        );
-        let u32s = [0_u32, 1 << 31, 1 << 20].map(|v| v.to_le_bytes().to_vec());
-        let values = fitted(Number::U32, 0.0, f64::from(1_u32 << 31));
-        assert_eq!(shown(&values, u32s), [1, 65_535, 33]);
-        let note = values.note().unwrap();
-        assert!(!note.contains("NaN"), "{note}");
-        assert!(fitted(Number::F64, 2.0, 2.0).scale().0.is_finite());
-    }
-
-    #[test]
-    fn names_stay_different_as_far_as_they_can() {
-        let values = Values::names(Number::U64, false).unwrap();
-        let names = (0..1000_u64).map(|n| (n * 1_000_003).to_le_bytes().to_vec());
-        let mut scattered = shown(&values, names);
-        assert_eq!(scattered[0], 0);
-        scattered.sort_unstable();
-        scattered.dedup();
-        assert!(scattered.len() > 950, "{} of 1000", scattered.len());
-        assert!(values.note().unwrap().contains("share"));
-        // Those that fit are what they are, and what is beyond them is no one thing.
-        let ids = [1_u64, 2, 65_535, 65_536, 65_537, 70_000, u64::MAX];
-        let shown = shown(&values, ids.map(|v| v.to_le_bytes().to_vec()));
-        assert_eq!(shown[..3], [1, 2, 65_535]);
-        let mut different = shown.clone();
-        different.sort_unstable();
-        different.dedup();
-        assert_eq!(different.len(), ids.len(), "{shown:?}");
-        assert!(!shown.contains(&0));
-        assert!(Values::names(Number::F32, false).is_none());
-    }
-
-    #[test]
-    fn signed_names_are_names_and_0_is_nothing() {
-        let values = Values::names(Number::I16, true).unwrap();
-        let stored = [0_i16, 1, 32_767, -1].map(|v| v.to_be_bytes().to_vec());
-        assert_eq!(shown(&values, stored), [0, 1, 32_767, 65_535]);
-        assert!(values.note().is_none());
-        let values = Values::names(Number::I32, false).unwrap();
-        let stored = [0_i32, 7, -7].map(|v| v.to_le_bytes().to_vec());
-        let shown = shown(&values, stored);
-        assert_eq!(shown[..2], [0, 7]);
-        assert!(shown[2] > 7);
-        assert_eq!(values.of_missing(&[0; 4]), 0);
-    }
-
-    #[test]
-    fn narrow_numbers_are_kept() {
-        let values = Values::kept(Number::I16, true).unwrap();
-        let stored = [-32_768_i16, 0, 32_767].map(|v| v.to_be_bytes().to_vec());
-        assert_eq!(shown(&values, stored), [0, 0x8000, 0xffff]);
-        assert_eq!(values.scale(), (1.0, 32_768.0));
-        assert!(Values::kept(Number::U32, false).is_none());
-    }
-}
+#[cfg(all(test, not(target_family = "wasm")))]
+mod tests;

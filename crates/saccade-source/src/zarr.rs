@@ -190,7 +190,7 @@ impl VolumeSource for ZarrSource {
         self.stored.read(id)
     }
 
-    fn renamed_label(&self) -> Option<u64> {
+    fn renamed_label(&self) -> Option<i128> {
         self.stored.renamed_label()
     }
 

@@ -91,6 +91,7 @@ fn a_remote_source_tells_what_has_changed() {
         let forgetful = Arc::new(Wide {
             labels: ArraySource::new(volume(), level0()).unwrap(),
             notes: Vec::new(),
+            id: 70_000,
             there: UVec3::ZERO,
             met: AtomicBool::new(false),
         });
@@ -152,6 +153,8 @@ fn an_export_through_a_server_goes_on() {
 struct Wide {
     labels: ArraySource,
     notes: Vec<String>,
+    /// Its id.
+    id: i128,
     /// The chunk that has it.
     there: UVec3,
     met: AtomicBool,
@@ -173,8 +176,8 @@ impl VolumeSource for Wide {
         self.labels.read(id)
     }
 
-    fn renamed_label(&self) -> Option<u64> {
-        self.met.load(Ordering::SeqCst).then_some(70_000)
+    fn renamed_label(&self) -> Option<i128> {
+        self.met.load(Ordering::SeqCst).then_some(self.id)
     }
 
     fn changes(&self) -> BoxStream<'static, Change> {
@@ -184,11 +187,18 @@ impl VolumeSource for Wide {
 
 #[test]
 fn ids_that_a_server_renames_are_known_where_they_are_read() {
+    id_that_a_server_renames(70_000);
+    id_that_a_server_renames(-3);
+    id_that_a_server_renames(u64::MAX.into());
+}
+
+fn id_that_a_server_renames(renamed: i128) {
     run(async {
         let there = UVec3::new(1, 1, 1);
         let source = Arc::new(Wide {
             labels: ArraySource::new(volume(), level0()).unwrap(),
             notes: vec!["ids were mapped".to_owned()],
+            id: renamed,
             there,
             met: AtomicBool::new(false),
         });
@@ -203,7 +213,7 @@ fn ids_that_a_server_renames_are_known_where_they_are_read() {
         assert_eq!(remote.renamed_label(), None, "none was met yet");
         assert_eq!(remote.notes(), ["ids were mapped"]);
         remote.read(id(there)).await.unwrap();
-        assert_eq!(remote.renamed_label(), Some(70_000));
+        assert_eq!(remote.renamed_label(), Some(renamed));
         // What was kept elsewhere says it as well, also where nothing is read again.
         let path = format!("{url}v/em/zarr/0/c/0/1/1/1");
         let client = reqwest::Client::new();
@@ -214,7 +224,7 @@ fn ids_that_a_server_renames_are_known_where_they_are_read() {
         let held = held.send().await.unwrap();
         assert_eq!(held.status(), reqwest::StatusCode::NOT_MODIFIED);
         for answer in [first, held] {
-            assert_eq!(answer.headers()[RENAMED_LABEL], "70000");
+            assert_eq!(answer.headers()[RENAMED_LABEL], *renamed.to_string());
         }
     });
 }

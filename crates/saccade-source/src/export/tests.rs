@@ -34,7 +34,7 @@ struct Formula {
     failures: AtomicU32,
     transient: bool,
     /// An id that does not fit, and the level in which it is met first.
-    wide: Option<(u64, u32)>,
+    wide: Option<(i128, u32)>,
     met: AtomicBool,
 }
 
@@ -43,7 +43,7 @@ impl Formula {
         Self::with_ids(failures, transient, None)
     }
 
-    fn with_ids(failures: u32, transient: bool, wide: Option<(u64, u32)>) -> Arc<Self> {
+    fn with_ids(failures: u32, transient: bool, wide: Option<(i128, u32)>) -> Arc<Self> {
         let extent = UVec3::new(75, 53, 13);
         let mut volume = Volume::new("em", extent, DVec3::new(4.0, 4.0, 8.0)).unwrap();
         volume.channels = ["a", "b", "c"].map(Into::into).into();
@@ -108,7 +108,7 @@ impl VolumeSource for Formula {
         })
     }
 
-    fn renamed_label(&self) -> Option<u64> {
+    fn renamed_label(&self) -> Option<i128> {
         let (id, _) = self.wide?;
         self.met.load(Ordering::SeqCst).then_some(id)
     }

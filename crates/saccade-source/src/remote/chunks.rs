@@ -1,6 +1,5 @@
 //! Chunks by HTTP.
 
-use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -100,7 +99,8 @@ impl RemoteSource {
         let answer = self.client.get(url.clone()).send();
         let answer = within(idle, &url, answer).await?.map_err(http)?;
         if let Some(id) = renamed_label(answer.headers()) {
-            self.renamed.store(id, Ordering::Relaxed);
+            // Whichever is the first.
+            let _ = self.renamed.set(id);
         }
         match answer.status() {
             StatusCode::OK => {}
@@ -161,7 +161,7 @@ fn chunk_url(volume: &Url, id: ChunkId, revision: u64) -> Url {
 }
 
 /// An id of labels that is another number in the server's volume, if it has met one.
-fn renamed_label(headers: &header::HeaderMap) -> Option<u64> {
+fn renamed_label(headers: &header::HeaderMap) -> Option<i128> {
     headers.get(RENAMED_LABEL)?.to_str().ok()?.parse().ok()
 }
 

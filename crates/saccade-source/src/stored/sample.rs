@@ -65,17 +65,13 @@ impl Sample {
             begin: UVec3::ZERO,
         };
         copy(stored, place, place.voxels, &mut all);
-        if let Some(new) = Values::spread(number, big_endian, &inside) {
+        if let Some(new) = Spread::of(number, big_endian, &inside) {
             self.widen(new);
         }
     }
 
     fn widen(&mut self, new: Spread) {
-        let Spread { min, max } = self.spread.unwrap_or(new);
-        self.spread = Some(Spread {
-            min: min.min(new.min),
-            max: max.max(new.max),
-        });
+        self.spread = Some(self.spread.map_or(new, |spread| spread.with(new)));
     }
 
     /// What to make of such numbers. What the image declares of its values counts where it is not far wider than those
@@ -86,30 +82,30 @@ impl Sample {
         big_endian: bool,
         declared: impl Iterator<Item = [f64; 2]>,
     ) -> Values {
-        if let Some(Spread { min, max }) = self.spread
-            && matches!(number, Number::F32 | Number::F64)
-        {
-            let span = max - min;
+        if let Some(Spread::Real { min, max }) = self.spread {
+            let largest = match number {
+                Number::F32 => f64::from(f32::MAX),
+                _ => f64::MAX,
+            };
+            let within = |min: f64, max: f64| Spread::Real {
+                min: min.clamp(-largest, largest),
+                max: max.clamp(-largest, largest),
+            };
+            // Half of it: all of it may be more than any number is.
+            let half = max / 2.0 - min / 2.0;
             for [low, high] in declared {
-                if high - low <= 8.0 * span {
-                    self.widen(Spread {
-                        min: low,
-                        max: high,
-                    });
+                if high / 2.0 - low / 2.0 <= 8.0 * half {
+                    self.widen(within(low, high));
                 }
             }
             if self.partial {
                 // Averages and samples have less extreme values.
-                let room = span / 2.0;
                 let low = if min >= 0.0 {
-                    (min - room).max(0.0)
+                    (min - half).max(0.0)
                 } else {
-                    min - room
+                    min - half
                 };
-                self.widen(Spread {
-                    min: low,
-                    max: max + room,
-                });
+                self.widen(within(low, max + half));
             }
         }
         Values::fitted(number, big_endian, self.spread)
@@ -119,6 +115,27 @@ impl Sample {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Room for what was not seen is no more than there are numbers.
+    #[test]
+    fn the_largest_numbers_have_no_infinite_window() {
+        let largest = f64::from(f32::MAX);
+        for (number, min, max) in [
+            (Number::F64, f64::MIN, f64::MAX),
+            (Number::F64, 1e307, 1.7e308),
+            (Number::F32, -largest, largest),
+        ] {
+            let mut sample = Sample::new(true);
+            sample.widen(Spread::Real { min, max });
+            let declared = [[0.0, 1.0], [f64::MIN, f64::MAX]];
+            let values = sample.values(number, false, declared.into_iter());
+            let note = values.note().unwrap();
+            assert!(!note.contains("inf "), "{note}");
+            assert_eq!(note.contains("from -3.4"), number == Number::F32, "{note}");
+            let (factor, shift) = values.scale();
+            assert!(factor > 0.0 && shift.is_finite(), "{note}");
+        }
+    }
 
     #[test]
     fn small_levels_are_looked_at_wholly_and_large_ones_here_and_there() {

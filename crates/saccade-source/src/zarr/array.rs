@@ -405,14 +405,26 @@ fn encoding_of(codecs: &[Value], rank: usize, number: Number) -> Result<Encoding
                     }
                 };
             }
+            ("transpose" | "bytes", true) => {
+                return Err(Refusal::Wrong(format!(
+                    "its codec {name:?} takes numbers, and comes where there are bytes: after \"bytes\""
+                )));
+            }
             (name, true) => encoding.codecs.push(codec_named(name)?),
-            (name, false) => return Err(unknown_codec(name)),
+            (name, false) => {
+                codec_named(name)?;
+                return Err(Refusal::Wrong(format!(
+                    "its codec {name:?} takes bytes, and none before it makes bytes of numbers (\"bytes\")"
+                )));
+            }
         }
     }
     if as_bytes {
         Ok(encoding)
     } else {
-        Err(Refusal::wrong("its codecs do not make bytes"))
+        Err(Refusal::wrong(
+            "none of its codecs makes bytes of numbers (\"bytes\")",
+        ))
     }
 }
 

@@ -26,7 +26,7 @@ use crate::stored::{
     ATTEMPTS, Indexed, Indices, Piece, PieceError, PieceId, Pieces, Place, Placed, Replaced,
     Sample, Stored, coalesced, is_replaced, never_the_same, sampled,
 };
-use crate::values::{Number, Values};
+use crate::values::{Inside, Number, Values};
 
 /// Indices of shards that are kept \[bytes\].
 const INDEX_CACHE: u64 = 64 << 20;
@@ -162,6 +162,20 @@ impl LevelArray {
             }
         }
         voxels
+    }
+
+    /// Which numbers of a chunk are voxels that are shown, where not all are.
+    fn inside(&self, number: u64) -> Option<Inside> {
+        let at = unravel(number, &self.grid);
+        let length = |n: u64| usize::try_from(n).expect("checked when it was read");
+        Inside::new(self.array.encoding.order.iter().map(|&axis| {
+            let (chunk, all) = (self.array.chunk[axis], self.array.shape[axis]);
+            let inside = match self.axes[axis] {
+                Axis::T => 1,
+                _ => chunk.min(all - at[axis] * chunk),
+            };
+            (length(chunk), length(inside))
+        }))
     }
 
     /// Chunks that a box of a channel's stored voxels touches: their numbers, and where they have their voxels.
@@ -380,8 +394,10 @@ impl ZarrImage {
         mut bytes: Bytes,
         values: Option<&Arc<Values>>,
     ) -> Raw {
-        let packing = &self.levels[id.level as usize].packing;
-        let decoding = Decoding::new(decoding::Packing::Zarr(packing.clone()), values);
+        let level = &self.levels[id.level as usize];
+        let packing = decoding::Packing::Zarr(level.packing.clone());
+        let inside = values.and_then(|_| level.inside(id.number));
+        let decoding = Decoding::new(packing, values).within(inside);
         let mut again = self.objects.is_remote();
         loop {
             match decode(decoding.clone(), bytes).await {
@@ -616,11 +632,10 @@ impl Stored for ZarrImage {
         let groups = groups.into_iter().map(|((level, _), ids)| {
             let (this, wanted) = (self.clone(), ids.clone());
             let work: Pieces = Box::pin(async move {
-                let missing = this
-                    .values
-                    .of_missing(&this.levels[level as usize].array.fill);
+                let fill = &this.levels[level as usize].array.fill;
+                let missing = || Piece::Uniform(this.values.of_missing(fill));
                 let read = this.raw(level, wanted, Some(&this.values)).await;
-                let piece = |raw: Option<Bytes>| raw.map_or(Piece::Uniform(missing), Piece::Values);
+                let piece = |raw: Option<Bytes>| raw.map_or_else(missing, Piece::Values);
                 read.into_iter()
                     .map(|(id, raw)| (id, raw.map(piece)))
                     .collect()

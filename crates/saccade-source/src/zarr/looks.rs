@@ -117,7 +117,7 @@ mod tests {
             window(&kept(Number::I16), Dtype::Uint16, [-32_768.0, -1.0]),
             Some([0.0, 32_767.0 / 65_535.0])
         );
-        let spread = Some(Spread {
+        let spread = Some(Spread::Real {
             min: -1.0,
             max: 3.0,
         });

@@ -538,4 +538,20 @@ async fn sharding_that_is_not_read_is_named() {
         named.contains("sharding is combined with other codecs"),
         "{named}"
     );
+    // Codecs that are known, though not in this order.
+    let bytes = json!({"name": "bytes", "configuration": {"endian": "little"}});
+    let zstd = json!({"name": "zstd", "configuration": {"level": 1, "checksum": false}});
+    for (codecs, words) in [
+        (json!([zstd]), "\"zstd\" takes bytes, and none before it"),
+        (
+            json!([zstd, bytes]),
+            "\"zstd\" takes bytes, and none before it",
+        ),
+        (json!([bytes, zstd, bytes]), "\"bytes\" takes numbers"),
+        (json!([]), "none of its codecs makes bytes"),
+        (json!(["pcodec"]), "encoded by \"pcodec\"; blosc"),
+    ] {
+        let named = refused(&codecs).await;
+        assert!(named.contains(words), "{named}");
+    }
 }

@@ -95,7 +95,7 @@ fn wide_ids_are_not_merged() {
         }
     }
     let renamed = source.renamed_label().unwrap();
-    assert!(renamed > 65_535 && numbers.contains_key(&renamed));
+    assert!(renamed > 65_535 && numbers.contains_key(&u64::try_from(renamed).unwrap()));
     let wide: Vec<u16> = { numbers.iter() }
         .filter(|(id, _)| **id > 65_535)
         .map(|(_, number)| *number)
@@ -159,4 +159,58 @@ fn signed_ids_are_not_moved() {
             .zip(&kept)
             .all(|(moved, kept)| moved ^ 0x8000 == *kept)
     );
+}
+
+/// Has z the fastest axis in each chunk, instead of x.
+fn turn(array: &Path, width: usize) {
+    let file = array.join("zarr.json");
+    let mut metadata: Value = serde_json::from_slice(&fs::read(&file).unwrap()).unwrap();
+    let turn = json!({"name": "transpose", "configuration": {"order": [1, 2, 0]}});
+    metadata["codecs"].as_array_mut().unwrap().insert(0, turn);
+    fs::write(&file, metadata.to_string()).unwrap();
+    let grid = VoxelBox::of_size(UVec3::new(2, 2, 4));
+    for UVec3 { x, y, z } in grid.iter() {
+        let file = array.join(format!("c/{z}/{y}/{x}"));
+        let bytes = fs::read(&file).unwrap();
+        let turned = (0..33 * 40 * 4).flat_map(|n| {
+            let (yx, z) = (n / 4, n % 4);
+            let from = (z * 33 * 40 + yx) * width;
+            &bytes[from..from + width]
+        });
+        fs::write(&file, turned.copied().collect::<Vec<u8>>()).unwrap();
+    }
+}
+
+/// A negative id is another number in a volume, whatever its type; what chunks have beyond the image is none of its ids.
+#[test]
+fn negative_ids_are_told_and_padding_is_not() {
+    for (dtype, width) in [("int16", 2), ("int32", 4)] {
+        for turned in [false, true] {
+            let root = tempfile::tempdir().unwrap();
+            let folder = root.path().join("things.zarr");
+            let mut metadata = version_3(dtype, [4, 33, 40], &plain());
+            metadata["fill_value"] = json!(-1);
+            let want = written::write(&folder, dtype, &metadata);
+            if turned {
+                turn(&folder.join("0"), width);
+            }
+            said_to_be_labels(&folder);
+            let read = || {
+                let source = open(&folder).unwrap();
+                (read_all(&runtime(), &source), source.renamed_label())
+            };
+            assert!(
+                read() == (want, None),
+                "{dtype}: all that is negative is padding"
+            );
+            let file = folder.join("0/c/3/1/1");
+            let mut bytes = fs::read(&file).unwrap();
+            bytes[..width].copy_from_slice(&(-3_i32).to_le_bytes()[..width]);
+            fs::write(&file, bytes).unwrap();
+            assert_eq!(read().1, Some(-3), "{dtype}");
+            // What is not stored has the id that the array says.
+            fs::remove_file(&file).unwrap();
+            assert_eq!(read().1, Some(-1), "{dtype}");
+        }
+    }
 }

@@ -62,6 +62,7 @@ pub(super) fn write(folder: &Path, dtype: &str, metadata: &Value) -> Vec<u16> {
         "uint8" => store!(u8, 251),
         "uint16" => store!(u16, 65_000),
         "uint32" => store!(u32, 65_000),
+        "int16" => store!(i16, 200),
         "int32" => store!(i32, 60_000),
         "uint64" => store!(u64, 100_000),
         "float64" => store!(f64, 60_000),
