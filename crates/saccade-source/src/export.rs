@@ -169,8 +169,10 @@ pub enum ExportError {
         id: i128,
     },
     /// Voxels could not be had.
-    #[error("cannot read what is to be exported")]
+    #[error("cannot read what is to be exported{}", asked(*times))]
     Read {
+        /// How often the chunk was asked for; a source may have made several attempts each time.
+        times: u32,
         /// Why.
         source: ChunkError,
     },
@@ -187,6 +189,13 @@ pub enum ExportError {
         /// What the library says.
         reason: String,
     },
+}
+
+fn asked(times: u32) -> String {
+    match times {
+        1 => String::new(),
+        times => format!(", though asked for {times} times"),
+    }
 }
 
 /// Writes an image into a storage; tells `progress` after each shard. Dropping the future gives up, and the

@@ -19,8 +19,8 @@ use crate::{Chunk, ChunkError, ChunkId, VolumeSource};
 
 /// Chunks that are read at a time for one shard.
 const CHUNKS_AT_ONCE: usize = 8;
-/// Attempts at a chunk that fails for passing reasons.
-const ATTEMPTS: u32 = 10;
+/// Times that a chunk is asked for which fails for passing reasons.
+const TIMES: u32 = 10;
 /// Longest pause between two of them.
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 
@@ -127,15 +127,18 @@ async fn patiently(
 ) -> Result<Chunk, ExportError> {
     let begun = Instant::now();
     let mut pause = options.retry;
-    let mut attempt = 1;
+    let mut times = 1;
     loop {
         let error: ChunkError = match source.read(id).await {
             Ok(chunk) => return Ok(chunk),
             Err(error) => error,
         };
-        let is_last = attempt == ATTEMPTS || begun.elapsed() >= options.patience;
+        let is_last = times == TIMES || begun.elapsed() >= options.patience;
         if !error.is_transient() || is_last {
-            return Err(ExportError::Read { source: error });
+            return Err(ExportError::Read {
+                times,
+                source: error,
+            });
         }
         match is_to_be_told() {
             true => log::warn!("{}; asking again", chain(&error)),
@@ -143,7 +146,7 @@ async fn patiently(
         }
         tokio::time::sleep(error.retry_after().unwrap_or(pause)).await;
         pause = (pause * 2).min(LONGEST_PAUSE);
-        attempt += 1;
+        times += 1;
     }
 }
 

@@ -431,7 +431,7 @@ fn passing_failures_are_waited_out_and_others_named() {
     for (failures, transient) in [(1, false), (100_000, true)] {
         let source: Arc<dyn VolumeSource> = Formula::new(failures, transient);
         let failed = run(export(&source, &MemoryStorage::new(), &options, &|_| {}));
-        let Err(ExportError::Read { source }) = failed else {
+        let Err(ExportError::Read { source, .. }) = failed else {
             panic!("{failed:?}")
         };
         assert!(source.to_string().contains("chunk"), "{source}");

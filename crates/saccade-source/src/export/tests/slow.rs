@@ -67,7 +67,7 @@ fn what_stalls_or_drips_is_asked_for_again_and_then_named() {
                     tokio::time::timeout(within, export(&always, &storage, &options, &none));
                 let failed = failed.await.expect("it ends").unwrap_err();
                 server.always.lock().unwrap().clear();
-                let ExportError::Read { source } = &failed else {
+                let ExportError::Read { source, .. } = &failed else {
                     panic!("{fault:?}: {failed:?}")
                 };
                 let named = chain(source);
@@ -115,4 +115,11 @@ fn a_chunk_is_not_asked_for_for_ever() {
     // Two shards of eight chunks at a time: two or three attempts each instead of ten.
     let attempts = 1_000_000 - formula.failures.load(Ordering::SeqCst);
     assert!((1..=16 * 4).contains(&attempts), "{attempts} attempts");
+    let told = failed.unwrap_err().to_string();
+    assert!(
+        [2, 3]
+            .iter()
+            .any(|n| told.ends_with(&format!(", though asked for {n} times"))),
+        "{told}"
+    );
 }
