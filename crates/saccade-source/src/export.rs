@@ -12,7 +12,8 @@
 //! The group's description, without which nobody takes the folder for an image, comes last. Until then
 //! `export.json` says what is being written; the same export begun again keeps the shards that are there, but for those in
 //! which the volume has changed since, as far as its source knows where; once the image is whole, its attribute `saccade` says the same, and how many shards there are. Begun
-//! once more, nothing is done where all of them are there; what is missing is exported again. What changes while it is exported is
+//! once more, nothing is done where all of them are there; what is missing is exported again, and so is a shard that has lost its end
+//! or its index. What changes while it is exported is
 //! exported again, until all is of one state.
 //!
 //! What was begun without letting ids of labels become others may go on with it: the shards that are there have only ids that fit.
@@ -23,6 +24,7 @@
 
 mod plan;
 mod shard;
+mod sound;
 #[cfg(test)]
 mod tests;
 
@@ -39,6 +41,7 @@ use saccade_core::voxel_box::VoxelBox;
 use crate::{ChunkError, VolumeSource};
 use plan::{Plan, ShardId};
 use shard::ShardEncoder;
+use sound::sound;
 
 /// Object in which an export says what it is, as long as it is not whole.
 pub const UNFINISHED: &str = "export.json";
@@ -230,7 +233,7 @@ pub async fn export(
     // Shards that are objects.
     let mut full = BTreeSet::new();
     if begun == Begun::Partly {
-        let there = there(storage, &plan).await?;
+        let there = sound(storage, &plan).await?;
         all.retain(|shard| {
             let missing = !there.contains(&shard.key());
             if !missing {
@@ -337,7 +340,7 @@ async fn is_whole(
     plan: &Plan,
     shards: Option<u64>,
 ) -> Result<bool, ExportError> {
-    let there = there(storage, plan).await?;
+    let there = sound(storage, plan).await?;
     let arrays = (0..plan.levels.len()).all(|level| there.contains(&format!("{level}/zarr.json")));
     let found = { plan.shards() }.filter(|shard| there.contains(&shard.key()));
     Ok(arrays && shards == Some(found.count() as u64))
@@ -433,7 +436,7 @@ async fn begin(
         if is_whole(storage, plan, there[SHARDS].as_u64()).await? {
             return Ok(Begun::Whole);
         }
-        // Somebody took a part of it away: no image until that is there again.
+        // Somebody took a part of it away, or spoilt it: no image until that is there again.
         storage.write_durable(UNFINISHED, pretty(&ours)).await?;
         storage.delete(GROUP).await?;
         return Ok(Begun::Partly);

@@ -141,7 +141,7 @@ fn an_export_through_a_server_goes_on() {
         }
         let done = exported().await.unwrap();
         assert!(
-            done.kept > 3 && done.kept <= there,
+            done.kept > 0 && done.kept < there,
             "{done:?}, {there} were there"
         );
         assert_eq!(done.done, done.shards);

@@ -418,6 +418,25 @@ fn what_was_taken_from_a_whole_export_is_exported_again() {
     let mended = again();
     assert_eq!((mended.was_whole, mended.bytes), (false, 0));
     assert!(image(&storage) == whole && again().was_whole);
+    // What is left of a shard, and a description that somebody edited.
+    let shard = &run(storage.list("0/c/1/")).unwrap()[0];
+    let bytes = run(storage.read(shard, None)).unwrap();
+    let mut flipped = bytes.to_vec();
+    let in_index = flipped.len() - 9;
+    flipped[in_index] ^= 1;
+    let (half, short) = (bytes.slice(..bytes.len() / 2), bytes.slice(..3));
+    for spoilt in [half, short, Bytes::new(), flipped.into()] {
+        run(storage.write_durable(shard, spoilt)).unwrap();
+        let mended = again();
+        assert!(
+            !mended.was_whole && mended.bytes == bytes.len() as u64,
+            "{mended:?}"
+        );
+        assert!(image(&storage) == whole && again().was_whole);
+    }
+    run(storage.write_durable("1/zarr.json", Bytes::from_static(b"{}"))).unwrap();
+    assert!(!again().was_whole);
+    assert!(image(&storage) == whole && again().was_whole);
 }
 
 #[test]

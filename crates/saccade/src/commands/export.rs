@@ -220,7 +220,7 @@ fn cut(region: VoxelBox, extent: UVec3) -> Option<String> {
 
 fn summary(done: &ExportProgress, seconds: f64) -> String {
     if done.was_whole {
-        return "nothing to do: this export is there, and whole".to_owned();
+        return "nothing to do: all of this export is there".to_owned();
     }
     let mut parts = vec![format!(
         "exported {} in {seconds:.0} s: {} shards",

@@ -1,0 +1,86 @@
+//! What is there of an export, as far as shards tell that without being decoded: whether each still has its index, and
+//! room for what that says.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use futures::{StreamExt as _, TryStreamExt as _, stream};
+use saccade_archive::storage::{Storage, StorageError};
+
+use super::plan::Plan;
+use super::{ExportError, pretty};
+
+/// Shards that are looked at at a time.
+const AT_ONCE: usize = 16;
+/// Of a chunk that a shard does not have, in its index.
+const NONE: u64 = u64::MAX;
+
+/// Names of the descriptions of levels and of the shards that are as they were written. What is damaged, somebody cut or
+/// wrote over, is told, and is as if it were not there.
+pub(super) async fn sound(
+    storage: &dyn Storage,
+    plan: &Plan,
+) -> Result<BTreeSet<String>, ExportError> {
+    let mut sizes = BTreeMap::new();
+    for level in 0..plan.levels.len() {
+        let entries = storage.entries(&format!("{level}/")).await?;
+        sizes.extend(entries.into_iter().map(|entry| (entry.name, entry.size)));
+    }
+    let mut sound = BTreeSet::new();
+    for level in 0..plan.levels.len() {
+        let name = format!("{level}/zarr.json");
+        if sizes.contains_key(&name)
+            && storage.read(&name, None).await? == pretty(&plan.array(level))
+        {
+            sound.insert(name);
+        }
+    }
+    let shards = plan.shards().filter_map(|shard| {
+        let key = shard.key();
+        let size = *sizes.get(&key)?;
+        let chunks = plan.levels[shard.level].shard / plan.volume.chunk;
+        let chunks: u64 = chunks.as_u64vec3().element_product();
+        Some(async move {
+            let is_sound = has_index(storage, &key, size, chunks).await?;
+            Ok::<_, ExportError>((key, is_sound))
+        })
+    });
+    let mut looked_at = stream::iter(shards).buffer_unordered(AT_ONCE);
+    while let Some((key, is_sound)) = looked_at.try_next().await? {
+        if is_sound {
+            sound.insert(key);
+        } else {
+            log::warn!("{key} of the export is damaged, and is exported again");
+        }
+    }
+    Ok(sound)
+}
+
+/// Whether a shard ends with an index of so many chunks that its checksum fits, and all of these lie before it.
+async fn has_index(
+    storage: &dyn Storage,
+    key: &str,
+    size: u64,
+    chunks: u64,
+) -> Result<bool, ExportError> {
+    let index = 16 * chunks + 4;
+    let Some(begin) = size.checked_sub(index) else {
+        return Ok(false);
+    };
+    let bytes = match storage.read(key, Some(begin..size)).await {
+        Ok(bytes) => bytes,
+        Err(StorageError::NotFound { .. }) => return Ok(false),
+        Err(error) => return Err(error.into()),
+    };
+    let Some((pairs, sum)) = bytes.split_last_chunk::<4>() else {
+        return Ok(false);
+    };
+    let (words, rest) = pairs.as_chunks::<8>();
+    let words: Vec<u64> = words.iter().copied().map(u64::from_le_bytes).collect();
+    let lies_before = |pair: &[u64]| {
+        let end = pair[0].checked_add(pair[1]);
+        pair == [NONE, NONE] || end.is_some_and(|end| end <= begin)
+    };
+    Ok(rest.is_empty()
+        && crc32c::crc32c(pairs) == u32::from_le_bytes(*sum)
+        && words.chunks_exact(2).all(lies_before))
+}
