@@ -68,7 +68,7 @@ pub(super) struct Opened {
     pub(super) writer: Option<SqlitePool>,
     readers: SqlitePool,
     /// What took the place of the file since, for those who read.
-    replaced: Replaced,
+    replaced: Box<Replaced>,
     closed: AtomicBool,
     /// Which file it was when it was opened; `None` if the system did not tell.
     id: Option<FileId>,
@@ -89,7 +89,7 @@ impl Opened {
             id: FileId::of(path).ok(),
             writer,
             readers,
-            replaced: Replaced::default(),
+            replaced: Box::default(),
             closed: AtomicBool::new(false),
             // What is there from before is not known.
             logged: AtomicU32::new(MOST_LOGGED),
