@@ -82,7 +82,7 @@ fn what_is_asked_for_outside_the_volume() {
         (&["--clip", "150,0,0,160,9,9"], &["along x", "150", "160"]),
         (
             &["--slice", "z=3", "--clip", "0,0,5,9,9,9"],
-            &["along z", "from 5 to 9", "from 3 to 3"],
+            &["along z", "from 5 to 9", "from 3.5 to 3.5"],
         ),
     ] {
         assert_failed(&render(more), 1, parts);
