@@ -97,8 +97,7 @@ fn numbers_that_are_none_are_refused() {
         ] {
             let answer = served.get(address).await;
             assert_eq!(answer.status(), StatusCode::BAD_REQUEST, "{address}");
-            let words: serde_json::Value =
-                serde_json::from_slice(&answer.bytes().await.unwrap()).unwrap();
+            let words: Value = serde_json::from_slice(&answer.bytes().await.unwrap()).unwrap();
             let error = words["error"].as_str().unwrap();
             assert!(error.contains("whole number"), "{words}");
             let responses = &document["paths"][path]["get"]["responses"];

@@ -57,7 +57,7 @@ mod tests {
         assert_eq!(Inside::new([(3, 3), (5, 5)]), None);
         assert_eq!(Inside::new([]), None);
         let lines = Inside::new([(1, 1), (4, 3), (5, 5), (7, 7)]).unwrap();
-        assert!(lines.runs().eq([0..105]));
+        assert!(lines.runs().eq(std::iter::once(0..105)));
         let rows = Inside::new([(2, 2), (3, 1), (5, 4)]).unwrap();
         assert!(rows.runs().eq([0..4, 15..19]));
     }
