@@ -97,7 +97,7 @@ pub(crate) struct Looks {
     detail: Details,
 
     /// Colours and opacities: auto, a JSON file, or JSON itself; of the first channel shown, or of channel N, as in
-    /// 2:FILE, once for each [default: auto]
+    /// 2:FILE, may be repeated; the last of each channel counts [default: auto]
     #[arg(long, value_name = "[N:]JSON")]
     transfer: Vec<String>,
 
@@ -139,16 +139,6 @@ impl Looks {
             ensure!(
                 shown.cut(plane),
                 "{MOST_CUTS} planes can cut at once; give --cut fewer times"
-            );
-        }
-        for (n, text) in self.transfer.iter().enumerate() {
-            let (channel, _) = channel_of_text(text);
-            let before = self.transfer[..n].iter();
-            let twice = { before }.any(|before| channel_of_text(before).0 == channel);
-            let whose = channel.map_or("the first channel".to_owned(), |n| format!("channel {n}"));
-            ensure!(
-                !twice,
-                "--transfer is given twice for {whose}; give it once for each"
             );
         }
         let transfers = self.transfer.iter().map(|text| transfer(text));

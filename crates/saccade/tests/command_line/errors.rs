@@ -270,10 +270,6 @@ fn a_window_without_a_display() {
             &["no transfer function", "--transfer"],
         ),
         (&["--transfer", "0:"], &["--transfer names no file"]),
-        (
-            &["--transfer", "0:auto", "--transfer", "0:auto"],
-            &["twice for channel 0"],
-        ),
     ] {
         assert_failed(&view(more), 1, parts);
     }
