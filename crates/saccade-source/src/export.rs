@@ -10,19 +10,24 @@
 //! # What happens meanwhile
 //!
 //! The group's description, without which nobody takes the folder for an image, comes last. Until then
-//! `export.json` says what is being written; the same export begun again keeps the shards that are there, but for those in
-//! which the volume has changed since, as far as its source knows where; once the image is whole, its attribute `saccade` says the same, and how many shards there are. Begun
-//! once more, nothing is done where all of them are there; what is missing is exported again, and so is a shard that has lost its end
-//! or its index. What changes while it is exported is
-//! exported again, until all is of one state.
+//! `export.json` says what is being written; the same export begun again keeps the shards that are there,
+//! but for those in which the volume has changed since, as far as its source knows where. Once the image is
+//! whole, its attribute `saccade` says the same, and how many shards there are. Begun once more, nothing is
+//! done where all of them are there; what is missing is exported again, and so is a shard that has lost its
+//! end or its index.
 //!
-//! What was begun without letting ids of labels become others may go on with it: the shards that are there have only ids that fit.
+//! What changes while it is exported is exported again, until all is of one state: once the volume rests,
+//! the finest levels first, so that a coarse shard waits for what changes below it.
+//!
+//! What was begun without letting ids of labels become others may go on with it: the shards that are there
+//! have only ids that fit.
 //!
 //! # Memory
 //!
 //! Two shards of at most 64 MiB, and what the source keeps.
 
 mod plan;
+mod queue;
 mod shard;
 mod sound;
 #[cfg(test)]
@@ -33,13 +38,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use futures::{FutureExt, StreamExt, stream};
+use futures::StreamExt;
+use futures::stream::FuturesUnordered;
 use glam::UVec3;
 use saccade_archive::storage::{Storage, StorageError};
 use saccade_core::voxel_box::VoxelBox;
 
 use crate::{ChunkError, VolumeSource};
 use plan::{Plan, ShardId};
+use queue::{Changes, Queue};
 use shard::ShardEncoder;
 use sound::sound;
 
@@ -73,6 +80,9 @@ pub struct ExportOptions {
     /// long. Each request has deadlines of its source's: [`Patience`](crate::objects::Patience),
     /// [`RemoteOptions`](crate::remote::RemoteOptions).
     pub patience: Duration,
+    /// How long nothing must have changed before shards are exported again; waited for at most fifteen times
+    /// as long.
+    pub quiet: Duration,
 }
 
 impl Default for ExportOptions {
@@ -85,6 +95,7 @@ impl Default for ExportOptions {
             rename_labels: false,
             retry: Duration::from_secs(1),
             patience: Duration::from_secs(300),
+            quiet: Duration::from_secs(2),
         }
     }
 }
@@ -215,13 +226,11 @@ pub async fn export(
 ) -> Result<ExportProgress, ExportError> {
     let plan = Plan::new(source.volume(), options)?;
     // Listened to first: what changes from here on is in the stream.
-    let mut changes = source.changes();
-    let mut revision = source.revision();
-    let begun = begin(&**source, storage, &plan, revision).await?;
+    let mut changes = Changes::of(source);
+    let begun = begin(&**source, storage, &plan, changes.revision()).await?;
 
-    let mut all: Vec<ShardId> = plan.shards().collect();
     let mut state = ExportProgress {
-        shards: all.len() as u64,
+        shards: plan.shards().count() as u64,
         was_whole: begun == Begun::Whole,
         ..ExportProgress::default()
     };
@@ -230,62 +239,61 @@ pub async fn export(
         progress(state);
         return Ok(state);
     }
-    // Shards that are objects.
-    let mut full = BTreeSet::new();
-    if begun == Begun::Partly {
-        let there = sound(storage, &plan).await?;
-        all.retain(|shard| {
-            let missing = !there.contains(&shard.key());
-            if !missing {
-                full.insert(*shard);
-            }
-            missing
-        });
-        state.kept = full.len() as u64;
-        state.done = state.kept;
-    }
+    let there = match begun {
+        Begun::Partly => sound(storage, &plan).await?,
+        _ => BTreeSet::new(),
+    };
+    // Shards that are objects, and those that are to be.
+    let (mut full, missing): (BTreeSet<ShardId>, BTreeSet<_>) =
+        { plan.shards() }.partition(|shard| there.contains(&shard.key()));
+    state.kept = full.len() as u64;
+    state.done = state.kept;
     progress(state);
 
     let encoder = ShardEncoder::new(&plan)?;
+    let mut queue = Queue::new(missing);
+    let mut running = FuturesUnordered::new();
     loop {
-        let mut written = stream::iter(&all)
-            .map(|&shard| {
-                let (encoder, plan) = (&encoder, &plan);
-                async move {
-                    let bytes = encoder.shard(source, plan, shard, options).await?;
-                    // Before it is written: an export that goes on keeps what is there.
-                    if let Some(id) = source.renamed_label().filter(|_| !plan.rename_labels) {
-                        return Err(ExportError::Label { id });
-                    }
-                    Ok((shard, write(storage, &shard.key(), bytes).await?))
-                }
-            })
-            .buffer_unordered(SHARDS_AT_ONCE);
-        while let Some(done) = written.next().await {
-            let (shard, bytes) = done?;
-            match bytes {
-                0 => full.remove(&shard),
-                _ => full.insert(shard),
-            };
-            state.done += 1;
-            state.empty += u64::from(bytes == 0);
-            state.bytes += bytes;
+        if queue.is_only_again() && running.is_empty() {
+            changes.wait_for_quiet(options.quiet).await;
+        }
+        let mut again = 0;
+        for voxels in changes.take() {
+            again += queue.changed(plan.touched(voxels));
+        }
+        if again > 0 {
+            state.again += again;
+            state.shards += again;
             progress(state);
         }
-        drop(written);
-        let mut again = BTreeSet::new();
-        while let Some(Some(change)) = changes.next().now_or_never() {
-            revision = revision.max(change.revision);
-            again.extend(plan.touched(change.voxels));
+        while running.len() < SHARDS_AT_ONCE
+            && let Some(shard) = queue.begin()
+        {
+            let (encoder, plan) = (&encoder, &plan);
+            running.push(async move {
+                let bytes = encoder.shard(source, plan, shard, options).await?;
+                // Before it is written: an export that goes on keeps what is there.
+                if let Some(id) = source.renamed_label().filter(|_| !plan.rename_labels) {
+                    return Err(ExportError::Label { id });
+                }
+                Ok((shard, write(storage, &shard.key(), bytes).await?))
+            });
         }
-        if again.is_empty() {
+        let Some(done) = running.next().await else {
             break;
-        }
-        all = again.into_iter().collect();
-        state.again += all.len() as u64;
-        state.shards += all.len() as u64;
+        };
+        let (shard, bytes) = done?;
+        queue.end(shard);
+        match bytes {
+            0 => full.remove(&shard),
+            _ => full.insert(shard),
+        };
+        state.done += 1;
+        state.empty += u64::from(bytes == 0);
+        state.bytes += bytes;
         progress(state);
     }
+    drop(running);
 
     for level in 0..plan.levels.len() {
         let text = pretty(&plan.array(level));
@@ -294,7 +302,7 @@ pub async fn export(
             .await?;
     }
     let mut group = plan.group();
-    group["attributes"][OURS] = state_of(&plan, revision);
+    group["attributes"][OURS] = state_of(&plan, changes.revision());
     group["attributes"][OURS][SHARDS] = full.len().into();
     storage.write_durable(GROUP, pretty(&group)).await?;
     storage.delete(UNFINISHED).await?;

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 
+use futures::stream;
 use glam::{DVec3, UVec3};
 use saccade_archive::storage::{FaultyStorage, LocalStorage, MemoryStorage, Storage, WriteFault};
 use saccade_core::volume::{Dtype, Volume};
@@ -491,7 +492,7 @@ fn what_cannot_be_is_refused_in_words() {
     assert!(refused(options).contains("0 to "));
 }
 
-fn array(extent: UVec3) -> ArraySource {
+pub(super) fn array(extent: UVec3) -> ArraySource {
     let mut volume = Volume::new("em", extent, DVec3::splat(8.0)).unwrap();
     volume.chunk = UVec3::splat(16);
     let voxels = VoxelBox::of_size(extent).iter();
@@ -501,6 +502,10 @@ fn array(extent: UVec3) -> ArraySource {
 
 #[test]
 fn what_changes_meanwhile_is_exported_again() {
+    let options = ExportOptions {
+        quiet: Duration::from_millis(10),
+        ..ExportOptions::default()
+    };
     let extent = UVec3::new(300, 40, 20);
     let fixed = array(extent);
     let live = Arc::new(array(extent));
@@ -509,13 +514,7 @@ fn what_changes_meanwhile_is_exported_again() {
     fixed.set(changed, &new_values).unwrap();
     let expected = MemoryStorage::new();
     let fixed: Arc<dyn VolumeSource> = Arc::new(fixed);
-    run(export(
-        &fixed,
-        &expected,
-        &ExportOptions::default(),
-        &|_| {},
-    ))
-    .unwrap();
+    run(export(&fixed, &expected, &options, &|_| {})).unwrap();
 
     let storage = MemoryStorage::new();
     let source: Arc<dyn VolumeSource> = live.clone();
@@ -525,26 +524,20 @@ fn what_changes_meanwhile_is_exported_again() {
             live.set(changed, &new_values).unwrap();
         }
     };
-    let done = run(export(
-        &source,
-        &storage,
-        &ExportOptions::default(),
-        &changes_late,
-    ))
-    .unwrap();
+    let done = run(export(&source, &storage, &options, &changes_late)).unwrap();
     assert!(done.again > 0 && done.again < done.shards / 2, "{done:?}");
     assert_eq!(done.done, done.shards);
     assert!(image(&storage) == image(&expected), "a mixture of states");
     let before: Arc<dyn VolumeSource> = Arc::new(array(extent));
     let other = MemoryStorage::new();
-    run(export(&before, &other, &ExportOptions::default(), &|_| {})).unwrap();
+    run(export(&before, &other, &options, &|_| {})).unwrap();
     assert!(
         image(&other) != image(&expected),
         "the change does not show"
     );
 
     // What was exported is of the state after the change, and not of a later one.
-    let again = |source| run(export(source, &storage, &ExportOptions::default(), &|_| {}));
+    let again = |source| run(export(source, &storage, &options, &|_| {}));
     assert!(again(&source).unwrap().was_whole);
     live.set(changed, &new_values).unwrap();
     let refused = again(&source).unwrap_err().to_string();
@@ -552,23 +545,17 @@ fn what_changes_meanwhile_is_exported_again() {
     let words = format!("revision {there}; the volume is at {now}");
     assert!(refused.contains(&words), "{refused}");
 
-    // One that was begun before a change is begun anew.
+    // One of which nothing is as it was when it began is begun anew.
     let storage = FaultyStorage::new(Arc::new(MemoryStorage::new()));
     storage.fail_write(4, WriteFault::Fail);
-    run(export(
-        &source,
-        &storage,
-        &ExportOptions::default(),
-        &|_| {},
-    ))
-    .unwrap_err();
-    live.set(changed, &new_values).unwrap();
-    let done = run(export(
-        &source,
-        &storage,
-        &ExportOptions::default(),
-        &|_| {},
-    ))
-    .unwrap();
-    assert_eq!(done.kept, 0);
+    let exported = || run(export(&source, &storage, &options, &|_| {}));
+    exported().unwrap_err();
+    assert!(names(&storage).len() > 1, "no shard to keep");
+    let whole = VoxelBox::of_size(extent);
+    let other_values = vec![78; usize::try_from(whole.voxels()).unwrap()];
+    live.set(whole, &other_values).unwrap();
+    assert_eq!(exported().unwrap().kept, 0);
+    let fresh = MemoryStorage::new();
+    run(export(&source, &fresh, &options, &|_| {})).unwrap();
+    assert!(image(&storage) == image(&fresh));
 }
