@@ -29,6 +29,7 @@ mod process;
 mod reasons;
 mod records;
 mod run;
+mod supply;
 mod waiting;
 
 pub use away::wait_until_there;

@@ -10,19 +10,18 @@ use futures::TryStreamExt;
 use futures::future::{Either, select};
 use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
-use saccade_archive::acquisition::{
-    AcquisitionInfo, Cursor, Record, RecordLine, RecordReader, TileRecord,
-};
-use saccade_archive::catalog::{CatalogError, Claim, Quarantined, Waiting, Worker};
+use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
+use saccade_archive::catalog::{CatalogError, Waiting, Worker};
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use super::enter::{COMMIT_AT_ONCE, Done, Enter, Ready, SetAside, retry};
+use super::enter::{COMMIT_AT_ONCE, Enter, SetAside, retry};
 use super::images::Images;
-use super::prepare::{Context, Outcome, Stored, quarantine};
+use super::prepare::{Context, Stored};
 use super::records::patiently;
-use super::waiting::{Due, WaitingRoom};
+use super::supply::{Job, Supply};
+use super::waiting::WaitingRoom;
 use super::{IngestError, IngestOptions, process, reasons};
 use crate::cancel::Cancel;
 use crate::held_up::Heard;
@@ -33,10 +32,6 @@ const LOOK_FOR_THE_DEAD: Duration = Duration::from_secs(1);
 
 /// Retired pyramids deleted per look.
 const DELETE_AT_ONCE: u32 = 64;
-
-/// Workers that ended with a record in hand, after which it is worked on alone, so that if it ends another, no
-/// other comes under suspicion.
-const SUSPECT: u32 = 2;
 
 /// What was done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -230,17 +225,6 @@ struct Ingest<'a> {
     left: AtomicU64,
 }
 
-/// A claimed record on its way.
-struct Job {
-    position: u64,
-    work: Work,
-}
-
-enum Work {
-    Tile(TileRecord),
-    Done(Outcome),
-}
-
 impl Ingest<'_> {
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
@@ -391,146 +375,6 @@ pub(super) fn state(
     }
 }
 
-/// Where work comes from.
-struct Supply<'a> {
-    archive: &'a VisualizationArchive,
-    options: &'a IngestOptions,
-    context: &'a Context<'a>,
-    worker: &'a Worker,
-    reader: &'a mut RecordReader,
-    left: &'a AtomicU64,
-    queue: VecDeque<Job>,
-    /// To be worked on alone, at the end.
-    suspects: Vec<Job>,
-    /// Records that may still be claimed before it is time to look after those that wait.
-    budget: usize,
-    worked: usize,
-    /// Whether there are records that have to wait for others.
-    blocked: bool,
-    /// Of what was done while reading.
-    summary: Summary,
-}
-
-impl Supply<'_> {
-    async fn next(&mut self) -> Result<Option<Job>, IngestError> {
-        if self.queue.is_empty() && self.budget > 0 && self.suspects.is_empty() {
-            let mut claimed = self.claim().await?;
-            if claimed == 0 && self.read_ahead().await? {
-                claimed = self.claim().await?;
-            }
-            self.budget = self.budget.saturating_sub(claimed);
-        }
-        let job = self.queue.pop_front();
-        self.worked += usize::from(job.is_some());
-        if let Some(Job { position, .. }) = job {
-            // Should it end this worker, it is known to have been in hand.
-            let (catalog, volume) = (self.archive.catalog(), self.context.volume);
-            let begin = || catalog.begin_record(volume, self.worker, position);
-            retry(self.options, self.context.progress, begin).await?;
-        }
-        Ok(job)
-    }
-
-    async fn claim(&mut self) -> Result<usize, IngestError> {
-        let (options, progress) = (self.options, self.context.progress);
-        // A few more than are worked on at once: each claim is a question to the catalog, but what is
-        // claimed and waits is nobody else's.
-        let most = (4 * options.workers.max(1)).min(self.budget);
-        let most = u32::try_from(most).unwrap_or(u32::MAX);
-        let (catalog, volume) = (self.archive.catalog(), self.context.volume);
-        let claim = || catalog.claim(volume, self.worker, most);
-        let claims = retry(options, progress, claim).await?;
-        let claimed = claims.len();
-        if claimed > 0 {
-            // Somebody may have read them from another acquisition since this one last looked.
-            self.catch_up().await?;
-        }
-        for claim in claims {
-            let deaths = claim.deaths;
-            let job = Job::claimed(claim, options, self.context.images);
-            if deaths >= SUSPECT {
-                self.suspects.push(job);
-            } else {
-                self.queue.push_back(job);
-            }
-        }
-        Ok(claimed)
-    }
-
-    /// Goes to where the volume's records were read up to, whoever did, if they are these: what is in the queue is not
-    /// to be looked for in another acquisition's images.
-    async fn catch_up(&mut self) -> Result<Cursor, IngestError> {
-        let (options, progress) = (self.options, self.context.progress);
-        let (catalog, volume) = (self.archive.catalog(), self.context.volume);
-        let from = retry(options, progress, || catalog.cursor(volume)).await?;
-        if self.reader.cursor() != from {
-            *self.reader = self.reader.at(from);
-        }
-        patiently(options, progress, || self.reader.recognize()).await?;
-        Ok(from)
-    }
-
-    /// Reads new records: tiles are put in the queue, the rest is done with at once, up to one that
-    /// speaks of a tile whose older records are still in the queue. Whether there were any.
-    async fn read_ahead(&mut self) -> Result<bool, IngestError> {
-        let (options, progress) = (self.options, self.context.progress);
-        let (catalog, volume) = (self.archive.catalog(), self.context.volume);
-        let batch = options.batch.max(1);
-        // Another worker may have read on.
-        let from = self.catch_up().await?;
-        let (queued, _) = retry(options, progress, || catalog.queued(volume)).await?;
-        if queued >= batch as u64 {
-            return Ok(false);
-        }
-        let lines = patiently(options, progress, || self.reader.read(batch)).await?;
-        self.blocked = false;
-        if lines.is_empty() {
-            self.left.store(queued, Ordering::Relaxed);
-            return Ok(false);
-        }
-        let lines: Vec<_> = lines.into_iter().map(|l| (l.next, New::from(l))).collect();
-        let (taken, done) = retry(options, progress, async || {
-            let mut commit = catalog.begin(volume).await?;
-            let mut done = Done::default();
-            let (mut taken, mut to) = (0, from);
-            for (next, line) in &lines {
-                match line {
-                    New::Tile(waiting) => commit.enqueue(waiting).await?,
-                    New::Done(outcome) => {
-                        // It is about what the tile is once all that came before is done.
-                        let tile = outcome.tile();
-                        if tile.is_some() && commit.is_queued(tile.unwrap_or_default()).await? {
-                            break;
-                        }
-                        done.apply(&mut commit, outcome).await?;
-                    }
-                }
-                (taken, to) = (taken + 1, *next);
-            }
-            if taken == 0 || !commit.advance(from, to).await? {
-                return Ok((0, Done::default()));
-            }
-            commit.finish().await?;
-            Ok((taken, done))
-        })
-        .await?;
-        self.context.set_aside.note(done.changes);
-        self.blocked = taken < lines.len();
-        for notice in &done.notices {
-            progress.notice(notice);
-        }
-        let at_once = lines[..taken]
-            .iter()
-            .filter(|(_, l)| matches!(l, New::Done(_)));
-        self.worked += at_once.count();
-        self.summary.moved += done.summary.moved;
-        self.summary.deleted += done.summary.deleted;
-        let left = queued + lines.len() as u64 + self.reader.remaining_lines();
-        self.left.store(left, Ordering::Relaxed);
-        Ok(taken > 0)
-    }
-}
-
 /// Works on all there is, `workers` at once.
 async fn enter_all(
     supply: &mut Supply<'_>,
@@ -569,94 +413,6 @@ async fn enter_all(
     // Both in this task: the work itself runs on blocking threads.
     futures::try_join!(prepare, commit)?;
     Ok(())
-}
-
-/// A record that was read just now.
-enum New {
-    Tile(Waiting),
-    Done(Outcome),
-}
-
-impl From<RecordLine> for New {
-    fn from(line: RecordLine) -> Self {
-        let position = line.offset;
-        match line.record {
-            Ok(Record::Tile(record)) => Self::Tile(Waiting {
-                position,
-                record,
-                reason: "its turn has not come".to_owned(),
-            }),
-            Ok(Record::Transform(record)) => Self::Done(Outcome::Transform { record, position }),
-            Ok(Record::Delete(record)) => Self::Done(Outcome::Delete { record, position }),
-            Err(broken) => {
-                // By the image, if the line names one: that is what people look for.
-                let what = Quarantined {
-                    file: broken
-                        .file
-                        .clone()
-                        .unwrap_or_else(|| RecordReader::FILE.to_owned()),
-                    tile: broken.tile.clone(),
-                    reason: format!("{broken}; append the record again as it should be"),
-                    bytes: Some(line.next.offset - line.offset),
-                    at: SystemTime::now(),
-                };
-                Self::Done(Outcome::Quarantine {
-                    what,
-                    pyramid: None,
-                })
-            }
-        }
-    }
-}
-
-impl From<Due> for Job {
-    fn from(due: Due) -> Self {
-        match due {
-            Due::Retry(waiting) => Self {
-                position: waiting.position,
-                work: Work::Tile(waiting.record),
-            },
-            Due::GiveUp { position, outcome } => Self {
-                position,
-                work: Work::Done(outcome),
-            },
-        }
-    }
-}
-
-impl Job {
-    fn claimed(claim: Claim, options: &IngestOptions, images: Images<'_>) -> Self {
-        let Claim {
-            waiting: Waiting {
-                position, record, ..
-            },
-            deaths,
-            ..
-        } = claim;
-        let work = if deaths >= options.attempts {
-            let then = if images.are_watched() {
-                "write it again as another"
-            } else {
-                "append its record again"
-            };
-            let reason = format!(
-                "{deaths} workers ended while they worked on it; look at the image, and {then}"
-            );
-            Work::Done(quarantine(images, &record, reason, None, None))
-        } else {
-            Work::Tile(record)
-        };
-        Self { position, work }
-    }
-
-    async fn prepare(self, context: &Context<'_>) -> Result<Ready, IngestError> {
-        let Self { position, work } = self;
-        let outcome = match work {
-            Work::Tile(record) => context.tile(record, position).await?,
-            Work::Done(outcome) => outcome,
-        };
-        Ok(Ready { position, outcome })
-    }
 }
 
 #[cfg(test)]
