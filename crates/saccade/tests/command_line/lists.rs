@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use image::{GrayImage, Luma};
 
+use super::answers::Client;
 use super::errors::{assert_failed, text};
 use super::server_away::{Program, says};
 use super::update::ended;
@@ -249,21 +250,13 @@ fn what_a_list_waits_for_is_in_its_status() {
         std::thread::sleep(Duration::from_millis(20));
     }
     let (_serving, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
-    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let client = Client::of(&url);
     let until = |fits: &dyn Fn(&[serde_json::Value]) -> bool| {
-        for _ in 0..600 {
-            let answer = reqwest::get(format!("{url}v/scope/status.json"));
-            let status =
-                runtime.block_on(async { answer.await?.json::<serde_json::Value>().await });
-            let held_up = status
-                .ok()
-                .and_then(|status| status["held_up"].as_array().cloned());
-            if held_up.as_deref().is_some_and(fits) {
-                return held_up.unwrap();
-            }
-            std::thread::sleep(Duration::from_millis(50));
-        }
-        panic!("it does not come about");
+        let fits = |held_up: &serde_json::Value| held_up.as_array().is_some_and(|all| fits(all));
+        let answer = client.until("v/scope/status.json", |answer| {
+            fits(&answer.json()["held_up"])
+        });
+        answer.json()["held_up"].as_array().cloned().unwrap()
     };
     let reason = until(&|held_up| !held_up.is_empty()).remove(0);
     let why = reason["why"].as_str().unwrap();
@@ -304,27 +297,9 @@ fn what_was_followed_before_is_waited_for_when_it_is_away_at_the_start() {
     done([&ingest[..], &["--once"]].concat());
 
     let (_serving, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
-    let runtime = tokio::runtime::Runtime::new().unwrap();
-    let status = || {
-        let answer = reqwest::get(format!("{url}v/scope/status.json"));
-        runtime.block_on(async {
-            answer
-                .await
-                .unwrap()
-                .json::<serde_json::Value>()
-                .await
-                .unwrap()
-        })
-    };
+    let client = Client::of(&url);
     let until = |is_so: &dyn Fn(&serde_json::Value) -> bool| {
-        for _ in 0..600 {
-            let status = status();
-            if is_so(&status) {
-                return;
-            }
-            std::thread::sleep(Duration::from_millis(50));
-        }
-        panic!("it does not come about: {}", status());
+        client.until("v/scope/status.json", |answer| is_so(&answer.json()));
     };
     let waits_for = |status: &serde_json::Value, what: &str| {
         let why = status["held_up"][0]["why"].as_str().unwrap_or_default();
