@@ -4,6 +4,7 @@ use glam::{DVec3, Vec3};
 use saccade_core::transfer::TransferFunction;
 use saccade_render::wgpu::util::DeviceExt as _;
 use saccade_render::{Gpu, View, wgpu};
+use serde_json::{Value, json};
 
 use crate::bricks::Arrays;
 use crate::clock::DrawClock;
@@ -11,6 +12,9 @@ use crate::shader::shader_module;
 
 /// As `dense.wgsl` has it, each vector padded to four words.
 type Frame = [[f32; 4]; 7];
+
+/// Between samples \[voxels\].
+const STEP_VOXELS: f32 = 0.5;
 
 /// Everything it needs on the device.
 pub(crate) struct Dense {
@@ -195,6 +199,24 @@ pub(crate) fn read_image(gpu: &Gpu, image: &wgpu::Texture) -> Vec<u8> {
         .collect()
 }
 
+/// The rays, for kernels elsewhere: vectors as `dense.wgsl` has them, and the extinction of the highest value \[1/nm\].
+pub(crate) fn rays(arrays: &Arrays, transfer: &TransferFunction, view: &View) -> Value {
+    let vectors = frame(arrays, view).map(|[x, y, z, _]| [x, y, z]);
+    let [eye, forward, right, down, extent, voxels_per_nm, _] = vectors;
+    let extinction = colors(transfer).last().map(|color| color[3]);
+    json!({
+        "size": view.size.to_array(),
+        "eye": eye,
+        "forward": forward,
+        "right": right,
+        "down": down,
+        "extent": extent,
+        "voxels_per_nm": voxels_per_nm,
+        "step_voxels": STEP_VOXELS,
+        "extinction": extinction,
+    })
+}
+
 fn frame(arrays: &Arrays, view: &View) -> Frame {
     let camera = &view.camera;
     let axes = camera.physical_from_eye_axes();
@@ -213,7 +235,7 @@ fn frame(arrays: &Arrays, view: &View) -> Frame {
         row(axes.y_axis * tangent),
         row(arrays.volume.extent().as_dvec3()),
         row(voxels_per_nm),
-        [x, y, 0.0, 0.0],
+        [x, y, STEP_VOXELS, 0.0],
     ]
 }
 

@@ -1,4 +1,4 @@
-// The simplest ray-caster there is: one dense texture, a sample every half voxel, from where the ray
+// The simplest ray-caster there is: one dense texture, a sample every step, from where the ray
 // enters until it leaves or nothing is seen through. No bricks, no tables, no tree.
 
 struct Frame {
@@ -9,6 +9,7 @@ struct Frame {
     extent: vec3f,       // [voxels]
     voxels_per_nm: vec3f,
     size: vec2u,         // [pixels]
+    step: f32,           // [voxels]
 }
 
 @group(0) @binding(0) var<uniform> frame: Frame;
@@ -36,7 +37,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let b = (frame.extent - frame.eye) * inverse;
     let enters = max(max(min(a.x, b.x), min(a.y, b.y)), max(min(a.z, b.z), 0.0));
     let leaves = min(min(max(a.x, b.x), max(a.y, b.y)), max(a.z, b.z));
-    let step = 0.5 / length(ray);
+    let step = frame.step / length(ray);
     var light = vec3f(0.0);
     var transmitted = 1.0;
     for (var start = enters; start < leaves && transmitted > 0.000244140625; start += step) {

@@ -48,6 +48,17 @@ impl Settings {
         }
     }
 
+    /// Writes a description as `NAME.json` where plots go.
+    pub(crate) fn json(&self, value: &serde_json::Value, name: &str) -> Result<()> {
+        let Some(folder) = &self.plots else {
+            return Ok(());
+        };
+        let file = folder.join(format!("{name}.json"));
+        { std::fs::create_dir_all(folder) }
+            .and_then(|()| std::fs::write(&file, format!("{value:#}\n")))
+            .with_context(|| format!("cannot write {}", file.display()))
+    }
+
     /// Writes a picture as `NAME.png` where plots go.
     pub(crate) fn picture(&self, picture: &GrayImage, name: &str) -> Result<()> {
         let Some(folder) = &self.plots else {

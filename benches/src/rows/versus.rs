@@ -11,9 +11,10 @@ use saccade_core::space::Point;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{Gpu, Renderer, RendererOptions, Traversal, View};
+use serde_json::json;
 
 use crate::bricks::{Arrays, Bricks, at_once, frame_ms, ramp, settle};
-use crate::dense::Dense;
+use crate::dense::{Dense, rays};
 use crate::report::Row;
 use crate::settings::Settings;
 use crate::volumes::Scale;
@@ -106,6 +107,10 @@ pub(crate) fn vs_dense_texture(settings: &Settings) -> Result<Vec<Row>> {
     let dense = Dense::new(gpu, &arrays, &transfer, &view);
     dense.frame_ms();
     let [ratios, ours, theirs] = ratios(|| frame_ms(&mut ours, &view), || dense.frame_ms());
+    let ours = median(ours);
+    let mut rays = rays(&arrays, &transfer, &view);
+    rays["renderer"] = json!({ "samples": statistics.samples, "ms": ours });
+    settings.json(&rays, "dense_texture.rays")?;
     let row = Row::new("render.vs_dense_texture", "ours over theirs", ratios)
         .setting("picture", format!("{}x{}", size.x, size.y))
         .setting(
@@ -113,7 +118,7 @@ pub(crate) fn vs_dense_texture(settings: &Settings) -> Result<Vec<Row>> {
             format!("{} x {} x {} voxels, tissue", extent.x, extent.y, extent.z),
         )
         .setting("transfer function", "a linear ramp: nothing is hidden")
-        .setting("ours_ms", median(ours))
+        .setting("ours_ms", ours)
         .setting("theirs_ms", median(theirs))
         .setting("page_tables_alone_ms", median(tables))
         .setting("samples", statistics.samples)
