@@ -17,6 +17,7 @@ mod streaming;
 mod table_9_1;
 mod update;
 mod versus;
+mod watch;
 mod workers;
 mod working_set;
 mod zarr_reads;
@@ -57,6 +58,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: ingest::SIMULATE_IDS,
         measure: |_| ingest::simulate(),
+    },
+    Group {
+        ids: watch::IDS,
+        measure: watch::measure,
     },
     Group {
         ids: codec::IDS,

@@ -109,7 +109,7 @@ async fn open_source(folder: &Path) -> Result<StitchedSource> {
 }
 
 /// Memory of this process \[bytes\].
-fn resident() -> Result<u64> {
+pub(super) fn resident() -> Result<u64> {
     let status = fs::read_to_string("/proc/self/status").context("memory needs /proc")?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
     let kib = line.and_then(|line| line.trim().strip_suffix(" kB"));
@@ -119,15 +119,18 @@ fn resident() -> Result<u64> {
     Ok(kib * 1024)
 }
 
-/// In the cache, beside the build.
 fn archive_folder() -> Result<PathBuf> {
+    Ok(cache_folder()?.join("bench/seven-million-tiles-1"))
+}
+
+/// Where builds and what rows keep for later runs are.
+pub(super) fn cache_folder() -> Result<PathBuf> {
     let set = |name| std::env::var_os(name).map(PathBuf::from);
     let home = || Some(set("HOME")?.join(".cache"));
     let user = || Some(set("XDG_CACHE_HOME").or_else(home)?.join("saccade"));
-    let cache = set("SACCADE_CACHE")
+    set("SACCADE_CACHE")
         .or_else(user)
-        .context("there is no HOME")?;
-    Ok(cache.join("bench/seven-million-tiles-1"))
+        .context("there is no HOME")
 }
 
 /// A catalog as ingest would leave it, apart from its changes, which nobody has to catch up with.
