@@ -3,6 +3,7 @@
 //! A chunk of ours may touch many of theirs, and one of theirs many of ours. Each of theirs is read and decoded
 //! once for all who want it, kept while there is room, and given up when nobody waits any more.
 
+mod packed;
 mod piece;
 mod placed;
 mod replaced;
@@ -10,7 +11,6 @@ mod sample;
 mod watch;
 
 use std::collections::HashMap;
-use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -25,9 +25,10 @@ use crate::objects::ObjectError;
 use crate::values::Values;
 use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 
+pub(crate) use packed::{AT_ONCE, Packed, Raw};
 pub(crate) use piece::{ChunkMut, Place, copy, fill};
 pub(crate) use placed::Placed;
-pub(crate) use replaced::{ATTEMPTS, Indexed, Indices, Replaced, is_replaced, never_the_same};
+pub(crate) use replaced::{Indexed, Indices, Replaced};
 pub(crate) use sample::{Sample, sampled};
 use watch::Watch;
 
@@ -37,8 +38,6 @@ const CACHE_BYTES: u64 = if cfg!(target_family = "wasm") {
 } else {
     512 << 20
 };
-/// Longest range that is read at once \[bytes\], unless a single chunk is longer.
-const MOST_AT_ONCE: u64 = 8 << 20;
 
 /// One of the image's own chunks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -337,44 +336,5 @@ pub(crate) fn volume_name(name: &str) -> String {
     match name.trim_start_matches('.') {
         "" => "image".to_owned(),
         name => name.to_owned(),
-    }
-}
-
-/// Ranges of an object that are better read together: each with the numbers of those it covers.
-///
-/// `gap` bytes between two cost less than another request.
-pub(crate) fn coalesced(ranges: &[Range<u64>], gap: u64) -> Vec<(Range<u64>, Vec<usize>)> {
-    let mut order: Vec<usize> = (0..ranges.len()).collect();
-    order.sort_by_key(|&n| (ranges[n].start, ranges[n].end));
-    let mut merged: Vec<(Range<u64>, Vec<usize>)> = Vec::new();
-    for n in order {
-        let range = &ranges[n];
-        if let Some((last, numbers)) = merged.last_mut()
-            && range.start <= last.end.saturating_add(gap)
-            && range.end.saturating_sub(last.start) <= MOST_AT_ONCE
-        {
-            last.end = last.end.max(range.end);
-            numbers.push(n);
-        } else {
-            merged.push((range.clone(), vec![n]));
-        }
-    }
-    merged
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn neighbours_are_read_together_and_strangers_are_not() {
-        let ranges = [100..200, 0..50, 210..300, 5000..6000, 40..90];
-        let merged = coalesced(&ranges, 10);
-        assert_eq!(merged, [(0..300, vec![1, 4, 0, 2]), (5000..6000, vec![3])]);
-        let long = [0..MOST_AT_ONCE, MOST_AT_ONCE..MOST_AT_ONCE + 1];
-        assert_eq!(coalesced(&long, 10).len(), 2);
-        let far = [u64::MAX - 1..u64::MAX, 0..1];
-        assert_eq!(coalesced(&far, 10).len(), 2);
-        assert_eq!(coalesced(&[], 10), []);
     }
 }

@@ -39,6 +39,7 @@
 mod array;
 mod error;
 mod image;
+mod level;
 mod looks;
 mod metadata;
 mod packing;
@@ -63,7 +64,8 @@ use crate::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 use array::Array;
 use error::Refusal;
 pub use error::ZarrError;
-use image::{LevelArray, ZarrImage};
+use image::ZarrImage;
+use level::LevelArray;
 use metadata::{Axis, Image};
 pub(crate) use packing::Packing;
 

@@ -1,6 +1,7 @@
 //! The voxels of a volume: which of its chunks they are in, and how those are read.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -11,25 +12,22 @@ use glam::UVec3;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
-use super::decode::{Packing, Shape};
-use super::info::{Info, Scale, Sharding};
+use super::decode::{self, Shape};
+use super::info::{Info, Scale};
 use super::shard::{Index, Minishard, compressed_morton, index_range};
 use crate::codecs::Damage;
-use crate::decoding::{self, Decoding, decode};
+use crate::decoding::{Decoding, Packing};
 use crate::flights::Work;
 use crate::objects::{Objects, Part};
 use crate::stored::{
-    ATTEMPTS, Indexed, Indices, Piece, PieceError, PieceId, Pieces, Place, Placed, Replaced,
-    Sample, Stored, coalesced, is_replaced, never_the_same, sampled,
+    AT_ONCE, Indexed, Indices, Packed, Piece, PieceError, PieceId, Pieces, Place, Placed, Raw,
+    Replaced, Sample, Stored, sampled,
 };
 use crate::values::Values;
 
 /// Indices of minishards that are kept \[bytes\].
 const INDEX_CACHE: u64 = 64 << 20;
-/// Objects, or ranges of one, that are read at once.
-const AT_ONCE: usize = 8;
 
-type Raw = Result<Option<Bytes>, PieceError>;
 type IndexId = (u32, Minishard);
 
 /// An open volume.
@@ -133,60 +131,6 @@ impl PrecomputedImage {
         Ok(sample)
     }
 
-    /// How messages name a chunk.
-    fn which(&self, id: PieceId) -> String {
-        let (at, _) = self.chunk(id);
-        format!("chunk {at} of level {}", id.level)
-    }
-
-    fn damaged(&self, id: PieceId, key: &str, reason: Damage) -> PieceError {
-        PieceError::Damaged {
-            reason,
-            which: self.which(id),
-            location: self.objects.location(key),
-        }
-    }
-
-    async fn part(&self, id: PieceId, key: &str, part: Part) -> Raw {
-        let read = self.objects.read(key, part).await;
-        read.map_err(|source| PieceError::Unread {
-            source: Arc::new(source),
-            which: self.which(id),
-        })
-    }
-
-    /// Decodes a chunk; what came over a network and does not decode is read once more.
-    async fn decoded(
-        &self,
-        id: PieceId,
-        key: &str,
-        part: Part,
-        mut bytes: Bytes,
-        values: Option<&Arc<Values>>,
-    ) -> Raw {
-        let scale = self.scale(id.level);
-        let zipped = scale.sharding.is_some_and(|sharding| sharding.data_gzip);
-        let most = usize::try_from(self.most_encoded(scale)).unwrap_or(usize::MAX);
-        let packing = Packing {
-            encoding: scale.encoding,
-            shape: self.shape(self.chunk(id).1.size()),
-            zipped: zipped.then_some(most),
-        };
-        let decoding = Decoding::new(decoding::Packing::Precomputed(packing), values);
-        let mut again = self.objects.is_remote();
-        loop {
-            match decode(decoding.clone(), bytes).await {
-                Ok(decoded) => return Ok(Some(decoded)),
-                Err(_) if again => again = false,
-                Err(damage) => return Err(self.damaged(id, key, damage)),
-            }
-            match self.part(id, key, part.clone()).await? {
-                Some(read) => bytes = read,
-                None => return Ok(None),
-            }
-        }
-    }
-
     /// Longest that an encoded chunk can sensibly be \[bytes\].
     fn most_encoded(&self, scale: &Scale) -> u64 {
         let decoded = self.shape(scale.chunk.min(scale.size)).bytes() as u64;
@@ -203,18 +147,15 @@ impl PrecomputedImage {
         values: Option<&Arc<Values>>,
     ) -> Vec<(PieceId, Raw)> {
         let scale = self.scale(level);
-        let most = self.most_encoded(scale);
-        match &scale.sharding {
-            None => {
-                let one = async |id: PieceId| (id, self.alone(id, most, values).await);
-                stream::iter(ids)
-                    .map(one)
-                    .buffer_unordered(AT_ONCE)
-                    .collect()
-                    .await
-            }
-            Some(sharding) => self.of_minishard(level, sharding, ids, values).await,
+        if let (Some(sharding), Some(&first)) = (&scale.sharding, ids.first()) {
+            let shard = sharding.minishard(self.number_in_shards(first)).shard;
+            let key = format!("{}/{}", scale.key, sharding.name(shard));
+            return self.together(&key, ids, values).await;
         }
+        let most = self.most_encoded(scale);
+        let one = async |id: PieceId| (id, self.alone(id, most, values).await);
+        let read = stream::iter(ids).map(one).buffer_unordered(AT_ONCE);
+        read.collect().await
     }
 
     /// A chunk that has an object to itself.
@@ -255,108 +196,53 @@ impl PrecomputedImage {
     fn number_in_shards(&self, id: PieceId) -> u64 {
         compressed_morton(self.chunk(id).0, self.scale(id.level).grid())
     }
+}
 
-    async fn of_minishard(
-        &self,
-        level: u32,
-        sharding: &Sharding,
-        ids: Vec<PieceId>,
-        values: Option<&Arc<Values>>,
-    ) -> Vec<(PieceId, Raw)> {
-        let Some(&first) = ids.first() else {
-            return Vec::new();
-        };
-        let minishard = sharding.minishard(self.number_in_shards(first));
-        let key = format!(
-            "{}/{}",
-            self.scale(level).key,
-            sharding.name(minishard.shard)
-        );
-        for _ in 0..ATTEMPTS {
-            let index = self.index(first, *sharding, minishard, &key).await;
-            let Indexed { index, version } = match index {
-                Ok(index) => index,
-                Err(error) if is_replaced(&error) => continue,
-                Err(error) => return ids.into_iter().map(|id| (id, Err(error.clone()))).collect(),
-            };
-            let Some(index) = index else {
-                return ids.into_iter().map(|id| (id, Ok(None))).collect();
-            };
-            let read = self.indexed(level, &key, &index, ids.clone(), values).await;
-            // Else its index was of another shard, whether that was noticed by this read or by one beside it.
-            let is_another = |(_, raw): &(_, Raw)| raw.as_ref().is_err_and(is_replaced);
-            if self.objects.replacements(&key) == version && !read.iter().any(is_another) {
-                return read;
-            }
-        }
-        let error = |id| never_the_same(self.which(id), self.objects.location(&key));
-        ids.into_iter().map(|id| (id, Err(error(id)))).collect()
+impl Packed for PrecomputedImage {
+    type Index = Index;
+
+    fn objects(&self) -> &dyn Objects {
+        &*self.objects
     }
 
-    /// Chunks of a minishard, by its index.
-    async fn indexed(
-        &self,
-        level: u32,
-        key: &str,
-        index: &Index,
-        ids: Vec<PieceId>,
-        values: Option<&Arc<Values>>,
-    ) -> Vec<(PieceId, Raw)> {
-        let most = self.most_encoded(self.scale(level));
-        let (mut done, mut wanted, mut ranges) = (Vec::new(), Vec::new(), Vec::new());
-        for id in ids {
-            match index.chunk(self.number_in_shards(id)) {
-                None => done.push((id, Ok(None))),
-                Some(range) if range.end - range.start > most => {
-                    let length = range.end - range.start;
-                    let reason =
-                        format!("its index says {length} bytes, and it can need {most} at most");
-                    done.push((id, Err(self.damaged(id, key, reason))));
-                }
-                Some(range) => {
-                    wanted.push(id);
-                    ranges.push(range);
-                }
-            }
+    fn which(&self, id: PieceId) -> String {
+        let (at, _) = self.chunk(id);
+        format!("chunk {at} of level {}", id.level)
+    }
+
+    fn decoding(&self, id: PieceId, values: Option<&Arc<Values>>) -> Decoding {
+        let scale = self.scale(id.level);
+        let zipped = scale.sharding.is_some_and(|sharding| sharding.data_gzip);
+        let most = usize::try_from(self.most_encoded(scale)).unwrap_or(usize::MAX);
+        let packing = decode::Packing {
+            encoding: scale.encoding,
+            shape: self.shape(self.chunk(id).1.size()),
+            zipped: zipped.then_some(most),
+        };
+        Decoding::new(Packing::Precomputed(packing), values)
+    }
+
+    fn range(&self, index: &Index, id: PieceId) -> Result<Option<Range<u64>>, Damage> {
+        let range = index.chunk(self.number_in_shards(id));
+        let length = range.as_ref().map_or(0, |range| range.end - range.start);
+        let most = self.most_encoded(self.scale(id.level));
+        match length > most {
+            true => Err(format!(
+                "its index says {length} bytes, and it can need {most} at most"
+            )),
+            false => Ok(range),
         }
-        let merged = coalesced(&ranges, self.objects.read_cost());
-        let (wanted, ranges) = (&wanted, &ranges);
-        let read = async |(span, numbers): (std::ops::Range<u64>, Vec<usize>)| {
-            let bytes = self
-                .part(wanted[numbers[0]], key, Part::Range(span.clone()))
-                .await;
-            let each = numbers.into_iter().map(|n| {
-                let (id, range, bytes) = (wanted[n], ranges[n].clone(), bytes.clone());
-                let begin = range.start - span.start;
-                async move {
-                    let bytes = match bytes {
-                        Ok(Some(bytes)) => bytes,
-                        Ok(None) => return (id, Ok(None)),
-                        Err(error) => return (id, Err(error)),
-                    };
-                    let at = |at: u64| usize::try_from(at).expect("within what was read");
-                    let own = bytes.slice(at(begin)..at(begin + (range.end - range.start)));
-                    (
-                        id,
-                        self.decoded(id, key, Part::Range(range), own, values).await,
-                    )
-                }
+    }
+
+    /// Of the minishard; none also if there is nothing in it.
+    async fn index(&self, of: PieceId, key: &str) -> Result<Indexed<Index>, PieceError> {
+        let Some(sharding) = self.scale(of.level).sharding else {
+            return Ok(Indexed {
+                index: None,
+                version: 0,
             });
-            futures::future::join_all(each).await
         };
-        let read = stream::iter(merged).map(read).buffer_unordered(AT_ONCE);
-        done.extend(read.collect::<Vec<_>>().await.into_iter().flatten());
-        done
-    }
-
-    /// The index of a minishard; none if there is nothing in it.
-    async fn index(
-        &self,
-        of: PieceId,
-        sharding: Sharding,
-        minishard: Minishard,
-        key: &str,
-    ) -> Result<Indexed<Index>, PieceError> {
+        let minishard = sharding.minishard(self.number_in_shards(of));
         let id = (of.level, minishard);
         let object = Replaced {
             object: (of.level, minishard.shard),
@@ -372,7 +258,7 @@ impl PrecomputedImage {
                     which: which.clone(),
                     location: objects.location(&key),
                 };
-                let read = async |range: std::ops::Range<u64>| {
+                let read = async |range: Range<u64>| {
                     let read = objects.read(&key, Part::Range(range)).await;
                     read.map_err(|source| PieceError::Unread {
                         source: Arc::new(source),

@@ -15,7 +15,7 @@ use crate::objects::{ObjectError, Objects};
 /// Indices that are known to have been missing.
 const KNOWN: usize = 1 << 14;
 /// Times that pieces are looked for in an object which is another each time.
-pub(crate) const ATTEMPTS: u32 = 4;
+pub(super) const ATTEMPTS: u32 = 4;
 
 /// Several pieces' object, by level and number within it.
 pub(crate) type ObjectId = (u32, u64);
@@ -139,12 +139,12 @@ where
 }
 
 /// Whether what a piece lies in was replaced while it was read.
-pub(crate) fn is_replaced(error: &PieceError) -> bool {
+pub(super) fn is_replaced(error: &PieceError) -> bool {
     matches!(error, PieceError::Unread { source, .. } if matches!(**source, ObjectError::Replaced { .. }))
 }
 
 /// The error where an object is another each time that it is read.
-pub(crate) fn never_the_same(which: String, location: String) -> PieceError {
+pub(super) fn never_the_same(which: String, location: String) -> PieceError {
     PieceError::Unread {
         source: Arc::new(ObjectError::Unavailable {
             attempts: ATTEMPTS,
