@@ -97,6 +97,28 @@ def shown(array, labels=False):
     return (array.astype(np.int64) - (low - 1)).astype(np.uint16)
 
 
+def row_of(array, to):
+    """Copies an array of one axis as one of two, of which the first has a length of 1: no chunk changes."""
+    def longer(said):
+        if isinstance(said, list):
+            return [longer(one) for one in said]
+        if not isinstance(said, dict):
+            return said
+        return {key: [1, *value] if key in ("shape", "chunks", "chunk_shape") else longer(value)
+                for key, value in said.items()}
+
+    to.mkdir()
+    for path in array.rglob("*"):
+        name = path.relative_to(array).as_posix()
+        if name in (".zarray", "zarr.json"):
+            (to / name).write_text(json.dumps(longer(json.loads(path.read_text()))))
+        elif name.startswith("c/"):
+            (to / "c/0").mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, to / "c/0" / path.name)
+        elif name.isdecimal():
+            shutil.copy(path, to / f"0.{name}")
+
+
 class Case(unittest.TestCase):
     def setUp(self):
         folder = tempfile.TemporaryDirectory(prefix="saccade-images-")
@@ -314,19 +336,90 @@ class Real(Case):
             self.refused(folder / f"all_0.6/{name}.zarr", "not supported", name.split("/")[1])
 
     def test_what_is_no_image_is_told(self):
-        folder = DATA / "neuroglancer-testdata/datasource"
-        self.refused(folder / "n5/n5_viewer_multiscale_modern", "N5, which is not read")
-        self.refused(folder / "zarr/zarr_v3/examples/single_res", "multiscales")
-        self.refused(folder / "zarr/zarr_v2/from_zarr-python/data.zarr/3d.chunked.i2", "array by itself")
+        """Whatever of Neuroglancer's fixtures is a volume, and not compared elsewhere, is refused by name."""
+        folder = DATA / "neuroglancer-testdata"
+        refused = {
+            "datasource/n5/**/attributes.json": "N5, which is not read",
+            "datasource/deepzoom/*.dzi": "Deep Zoom image, which is not read",
+            "datasource/nifti/*.nii": "NIfTI file, which is not read",
+            "datasource/nifti/*.nii.gz": "NIfTI file, which is not read",
+            "datasource/zarr/**/*.zip": "zip file, which is not read; unpack it",
+            "datasource/zarr/**/manifest.ocdbt": "OCDBT database, which is not read",
+            "kvstore/ocdbt/*/manifest.ocdbt": "OCDBT database, which is not read",
+            "kvstore/icechunk/*/refs": "Icechunk repository, which is not read",
+            "kvstore/icechunk/single_array/zarr.json": "array by itself",
+            "kvstore/icechunk/hierarchy/**/zarr.json": "",
+            "kvstore/zip/*.zip": "zip file, which is not read; unpack it",
+            "codec/npy/*.npy": "are folders; convert it to OME-Zarr",
+            "datasource/zarr/zarr_v[23]/*/*.zarr/.z*": "multiscales",
+            "datasource/zarr/zarr_v[23]/*/*.zarr/zarr.json": "multiscales",
+            "datasource/zarr/zarr_v[23]/*/*.zarr/*/.zarray": "array by itself",
+            "datasource/zarr/zarr_v[23]/*/*.zarr/*/zarr.json": "array by itself",
+            "datasource/zarr/zarr_v3/examples/*/zarr.json": "array by itself",
+        }
+        for pattern, word in refused.items():
+            found = {path if path.suffix in (".dzi", ".nii", ".gz", ".zip", ".npy") else path.parent
+                     for path in folder.glob(pattern)}
+            self.assertTrue(found, pattern)
+            for path in found:
+                with self.subTest(path.relative_to(folder)):
+                    self.refused(path, word or "multiscales")
+
+    def test_neuroglancer_s_segmentation(self):
+        """Numbers that somebody cut out, written anew as the format says, with no reader in between."""
+        raw = DATA / "neuroglancer-testdata/codec/compressed_segmentation/64x64x64-raw-uint64-segmentation.dat"
+        bodies = np.fromfile(raw, "<u8").reshape((64, 64, 64, 1), order="F")
+        self.assertGreater(len(np.unique(bodies)), 10)
+        for sharding in [{}, {"sharding": {"@type": "neuroglancer_uint64_sharded_v1", "preshift_bits": 1, "minishard_bits": 2,
+                                           "shard_bits": 1, "hash": "murmurhash3_x86_128", "data_encoding": "gzip",
+                                           "minishard_index_encoding": "gzip"}}]:
+            folder = self.work / f"bodies{len(sharding)}"
+            spec = {
+                "driver": "neuroglancer_precomputed", "kvstore": f"file://{folder}/", "create": True,
+                "multiscale_metadata": {"type": "segmentation", "data_type": "uint64", "num_channels": 1},
+                "scale_metadata": {"resolution": [8, 8, 8], "size": [64, 64, 64], "chunk_size": [32, 16, 24],
+                                   "encoding": "compressed_segmentation", "compressed_segmentation_block_size": [8, 8, 4],
+                                   **sharding},
+            }
+            tensorstore.open(spec).result().write(bodies).result()
+            with self.subTest(sharded=bool(sharding)):
+                self.same(folder, moved_to_czyx(shown(bodies, labels=True), "xyzc"))
+
+    def test_neuroglancer_s_precomputed(self):
+        """Of these there are descriptions alone: without voxels they are empty, and with tensorstore's they are those."""
+        for name, channels in [("one_channel", 1), ("two_channels", 2)]:
+            there = DATA / "neuroglancer-testdata/datasource/precomputed" / name
+            self.assertEqual([path.name for path in there.iterdir()], ["info"])
+            [empty] = self.opened(there)
+            self.assertEqual(empty.shape, (channels, 30, 20, 10))
+            self.assertFalse(empty.any())
+            info = json.loads((there / "info").read_text())
+            scales = info["scales"]
+            self.assertEqual(len(scales), 3)
+            # What fits into a chunk is exported without coarser levels: each level in turn is the finest.
+            for n in range(len(scales)):
+                folder = self.work / f"{name}{n}"
+                folder.mkdir()
+                (folder / "info").write_text(json.dumps({**info, "scales": scales[n:]}))
+                spec = {"driver": "neuroglancer_precomputed", "scale_index": 0, "kvstore": f"file://{folder}/"}
+                store = tensorstore.open(spec, open=True).result()
+                array = np.random.default_rng(n).integers(0, 65_535, store.shape, "u2", endpoint=True)
+                store.write(array).result()
+                with self.subTest(name, scale=n):
+                    self.same(folder, moved_to_czyx(array, "xyzc"))
 
     def test_neuroglancer_s_arrays(self):
         """Arrays of two and three axes, as levels of images that are made around them."""
         opened = 0
-        for folder, zarr_format in [("zarr_v2/from_zarr-python", 2), ("zarr_v3/from_zarrita", 3)]:
-            arrays = DATA / "neuroglancer-testdata/datasource/zarr" / folder / "data.zarr"
-            for array in sorted(arrays.glob("[23]d.*")):
-                axes = {"2": "yx", "3": "zyx"}[array.name[0]]
-                image = self.work / f"{zarr_format}{array.name}.zarr"
+        for folder, zarr_format in [("zarr/zarr_v2/from_zarr-python/data.zarr/[23]d.*", 2),
+                                    ("zarr/zarr_v3/from_zarrita/data.zarr/[23]d.*", 3),
+                                    ("zarr/zarr_v3/examples/single_res", 3),
+                                    ("../kvstore/icechunk/single_array", 3), ("../kvstore/icechunk/hierarchy/a", 3)]:
+            arrays = sorted((DATA / "neuroglancer-testdata/datasource").glob(folder))
+            self.assertTrue(arrays, folder)
+            for array in arrays:
+                axes = "zyx" if array.name.startswith("3d") else "yx"
+                image = self.work / f"{opened}{array.name}.zarr"
                 group_of(image, zarr_format, attributes(axes))
                 shutil.copytree(array, image / "0")
                 with self.subTest(array.name, zarr_format=zarr_format):
@@ -335,7 +428,30 @@ class Real(Case):
                         continue
                     self.same(image, *self.levels(image, axes))
                     opened += 1
-        self.assertGreater(opened, 15)
+        self.assertGreater(opened, 20)
+
+    def test_neuroglancer_s_arrays_of_one_axis(self):
+        """As images they are refused; as the only row of one their numbers are those that zarr-python reads of the axis."""
+        opened = 0
+        for folder, zarr_format in [("zarr_v2/from_zarr-python", 2), ("zarr_v3/from_zarrita", 3)]:
+            arrays = DATA / "neuroglancer-testdata/datasource/zarr" / folder / "data.zarr"
+            for array in sorted(arrays.glob("1d.*")):
+                with self.subTest(array.name, zarr_format=zarr_format):
+                    line, image = (self.work / f"{kind}{zarr_format}{array.name}.zarr" for kind in ["line", "row"])
+                    group_of(line, zarr_format, attributes("x"))
+                    shutil.copytree(array, line / "0")
+                    kind = array.name.split(".")[-2 if array.name.endswith("e") else -1]
+                    if kind in ("S7", "U7", "U13", "b1"):
+                        self.refused(line, "whole numbers of 8 to 64 bit")
+                        continue
+                    self.refused(line, "no axes x and y, which images need, but x")
+                    group_of(image, zarr_format, attributes("yx"))
+                    row_of(array, image / "0")
+                    [numbers] = self.levels(image, "yx")
+                    np.testing.assert_array_equal(numbers[0, 0, 0], shown(zarr.open_array(array, mode="r")[...]))
+                    self.same(image, numbers)
+                    opened += 1
+        self.assertGreater(opened, 20)
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ pub enum ImageError {
 }
 
 /// What else there may be, by an object that it has.
-const OTHERS: [(&str, &str); 4] = [
+const OTHERS: [(&str, &str); 6] = [
     (
         "attributes.json",
         "N5, which is not read; convert it to OME-Zarr",
@@ -103,6 +103,47 @@ const OTHERS: [(&str, &str); 4] = [
         "manifest.ocdbt",
         "an OCDBT database, which is not read; copy its content into files",
     ),
+    ("refs/branch.main/ref.json", ICECHUNK),
+    // Of its first version.
+    ("refs/branch.main/ZZZZZZZZ.json", ICECHUNK),
+];
+const ICECHUNK: &str =
+    "an Icechunk repository, which is not read; copy its arrays into a Zarr group of files";
+/// What a file is, by the end of its name, which says most of them; those that no other fits last.
+#[cfg(not(target_family = "wasm"))]
+const FILES: [(&str, &str); 8] = [
+    (
+        ".zip",
+        "a zip file, which is not read; unpack it, and name the folder",
+    ),
+    (
+        ".nii",
+        "a NIfTI file, which is not read; convert it to OME-Zarr",
+    ),
+    (
+        ".nii.gz",
+        "a NIfTI file, which is not read; convert it to OME-Zarr",
+    ),
+    (
+        ".dzi",
+        "a Deep Zoom image, which is not read; convert it to OME-Zarr",
+    ),
+    (
+        ".sqlite",
+        "a database; if it is the catalog of an archive, name the archive's folder",
+    ),
+    (
+        ".tif",
+        "a TIFF file; `saccade demo --input` shows stacks of them, else convert it to OME-Zarr",
+    ),
+    (
+        ".tiff",
+        "a TIFF file; `saccade demo --input` shows stacks of them, else convert it to OME-Zarr",
+    ),
+    (
+        "",
+        "a file, while archives and the images that are read (OME-Zarr, precomputed) are folders; convert it to OME-Zarr",
+    ),
 ];
 /// Longest object that is looked at for that \[bytes\].
 const MOST: u64 = 16 << 20;
@@ -115,6 +156,28 @@ async fn other(objects: &dyn Objects) -> Option<&'static str> {
             return Some(what);
         }
     }
+    None
+}
+
+/// Whether what is at a path is known as something that is not read, of which opening it as an image tells.
+#[cfg(not(target_family = "wasm"))]
+pub fn is_other(path: &std::path::Path) -> bool {
+    path.is_file() || OTHERS.iter().any(|(key, _)| path.join(key).is_file())
+}
+
+/// What is at a path, if that is a file.
+#[cfg(not(target_family = "wasm"))]
+fn file(location: &Location) -> Option<&'static str> {
+    let Location::Folder(path) = location else {
+        return None;
+    };
+    let name = path.file_name()?.to_string_lossy().to_ascii_lowercase();
+    let kind = { FILES.iter() }.find(|(end, _)| name.ends_with(end))?;
+    path.is_file().then_some(kind.1)
+}
+
+#[cfg(target_family = "wasm")]
+fn file(_: &Location) -> Option<&'static str> {
     None
 }
 
@@ -133,11 +196,8 @@ pub async fn open(location: &Location) -> Result<OpenImage, ImageError> {
 /// # Errors
 ///
 /// As [`open`].
-pub async fn open_with(
-    location: &Location,
-    options: ImageOptions,
-) -> Result<OpenImage, ImageError> {
-    let (objects, name) = (location.objects()?, location.name());
+pub async fn open_with(place: &Location, options: ImageOptions) -> Result<OpenImage, ImageError> {
+    let (objects, name) = (place.objects()?, place.name());
     match ZarrSource::open_with(objects.clone(), &name, options).await {
         Ok(source) => {
             let notes = source.notes().to_vec();
@@ -154,11 +214,15 @@ pub async fn open_with(
             Ok(OpenImage { source, notes })
         }
         Err(PrecomputedError::NoVolume { .. }) => {
-            let location = location.to_string();
+            let location = place.to_string();
             if let Some(advice) = objects.denied() {
                 return Err(ImageError::Denied { advice, location });
             }
-            Err(match other(&*objects).await {
+            let what = match file(place) {
+                None => other(&*objects).await,
+                file => file,
+            };
+            Err(match what {
                 Some(what) => ImageError::Other { what, location },
                 None => ImageError::None { location },
             })
@@ -183,11 +247,41 @@ mod tests {
             (".zgroup", "Zarr group without"),
             (".zarray", "array by itself"),
             ("attributes.json", "is N5"),
+            ("manifest.ocdbt", "OCDBT"),
+            ("refs/branch.main/ref.json", "Icechunk"),
         ] {
-            std::fs::write(folder.path().join(name), "{}").unwrap();
+            assert!(!is_other(folder.path()));
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, "{}").unwrap();
             let refused = refused().await;
             assert!(refused.contains(words), "{refused}");
-            std::fs::remove_file(folder.path().join(name)).unwrap();
+            assert!(is_other(folder.path()));
+            std::fs::remove_file(path).unwrap();
+        }
+        let array = r#"{"zarr_format": 3, "node_type": "array", "attributes": {}}"#;
+        std::fs::write(folder.path().join("zarr.json"), array).unwrap();
+        let refused = refused().await;
+        assert!(refused.contains("array by itself"), "{refused}");
+    }
+
+    #[tokio::test]
+    async fn files_are_told_by_what_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, words) in [
+            ("image.ome.zarr.zip", "unpack it"),
+            ("brain.nii.gz", "NIfTI"),
+            ("BRAIN.NII", "NIfTI"),
+            ("stack.ome.tif", "saccade demo --input"),
+            ("catalog.sqlite", "the archive's folder"),
+            ("photo.czi", "are folders; convert it"),
+        ] {
+            let file = folder.path().join(name);
+            std::fs::write(&file, "something").unwrap();
+            let location = Location::Folder(file.clone());
+            let refused = open(&location).await.err().unwrap().to_string();
+            assert!(refused.contains(words), "{refused}");
+            assert!(is_other(&file));
         }
     }
 }

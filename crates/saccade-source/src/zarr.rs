@@ -225,7 +225,16 @@ fn below(folder: &str, name: &str) -> String {
 
 /// The attributes of a group, whatever its version; `None` if there is none.
 async fn attributes(objects: &dyn Objects, folder: &str) -> Result<Option<Value>, ZarrError> {
-    if let Some(mut group) = json(objects, &below(folder, "zarr.json")).await? {
+    let key = below(folder, "zarr.json");
+    if let Some(mut group) = json(objects, &key).await? {
+        let is_image = metadata::ome(&group["attributes"])["multiscales"].is_array();
+        if group["node_type"] == "array" && !is_image {
+            let refusal = Refusal::Unsupported(
+                "it is an array by itself; name the image (multiscales) that it is a level of"
+                    .to_owned(),
+            );
+            return Err(refusal.at(objects.location(folder)));
+        }
         return Ok(Some(group["attributes"].take()));
     }
     json(objects, &below(folder, ".zattrs")).await

@@ -158,14 +158,17 @@ impl FromStr for Place {
 }
 
 /// Whether an image that somebody else wrote is in a folder, or what they know as one (N5), or should be by the folder's name:
-/// then what is missing is an image.
+/// then what is missing is an image. Also a file, which is no archive either.
 fn is_image(folder: &Path) -> bool {
     let has = |name: &str| folder.join(name).is_file();
     let is_archive = || has(VisualizationArchive::CATALOG) || is_half_export(folder);
     let named = folder
         .extension()
         .is_some_and(|extension| extension == "zarr" || extension == "n5");
-    ZarrSource::is_zarr(folder) || has("info") || has("attributes.json") || (named && !is_archive())
+    ZarrSource::is_zarr(folder)
+        || has("info")
+        || images::is_other(folder)
+        || (named && !is_archive())
 }
 
 /// Opens an image, and tells what its user should know.

@@ -285,7 +285,10 @@ fn axes(named: Option<&Vec<Value>>, rank: usize) -> Result<Vec<Axis>, Refusal> {
         axes.push(axis);
     }
     if !(axes.contains(&Axis::Space(0)) && axes.contains(&Axis::Space(1))) {
-        return Err(wrong("it has no axes x and y".to_owned()));
+        let names = names.join(", ");
+        return Err(Refusal::Unsupported(format!(
+            "it has no axes x and y, which images need, but {names}"
+        )));
     }
     Ok(axes)
 }
