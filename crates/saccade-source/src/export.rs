@@ -12,7 +12,8 @@
 //! The group's description, without which nobody takes the folder for an image, comes last. Until then
 //! `export.json` says what is being written; the same export begun again keeps the shards that are there,
 //! but for those in which the volume has changed since, as far as its source knows where. Once the image is
-//! whole, its attribute `saccade` says the same, and how many shards there are. Begun once more, nothing is
+//! whole, its attribute `saccade` says the same, and how many shards there are, and that of its finest level
+//! does, by which an image goes on that has lost its description. Begun once more, nothing is
 //! done where all of them are there; what is missing is exported again, and so is a shard that has lost its
 //! end or its index.
 //!
@@ -54,8 +55,11 @@ use sound::sound;
 pub const UNFINISHED: &str = "export.json";
 /// What makes a folder an image.
 const GROUP: &str = "zarr.json";
-/// Attribute of it that says which export it is.
+/// Attribute of it, and of the finest level, that says which export it is.
 const OURS: &str = "saccade";
+/// What describes the finest level, and where in it that attribute is.
+const FINEST: &str = "0/zarr.json";
+const STATE: &str = "/attributes/saccade";
 /// How many shards there are, in it.
 const SHARDS: &str = "shards";
 /// Shards at a time: one is read while the other is compressed and written.
@@ -295,14 +299,17 @@ pub async fn export(
     }
     drop(running);
 
+    let ours = state_of(&plan, changes.revision());
     for level in 0..plan.levels.len() {
-        let text = pretty(&plan.array(level));
-        storage
-            .write_durable(&format!("{level}/zarr.json"), text)
-            .await?;
+        let mut array = plan.array(level);
+        if level == 0 {
+            array["attributes"][OURS] = ours.clone();
+        }
+        let key = format!("{level}/zarr.json");
+        storage.write_durable(&key, pretty(&array)).await?;
     }
     let mut group = plan.group();
-    group["attributes"][OURS] = state_of(&plan, changes.revision());
+    group["attributes"][OURS] = ours;
     group["attributes"][OURS][SHARDS] = full.len().into();
     storage.write_durable(GROUP, pretty(&group)).await?;
     storage.delete(UNFINISHED).await?;
@@ -410,16 +417,23 @@ async fn begin(
     revision: u64,
 ) -> Result<Begun, ExportError> {
     let ours = state_of(plan, revision);
-    if let Some(begun) = json(storage, UNFINISHED).await? {
+    let unfinished = json(storage, UNFINISHED).await?;
+    let group = json(storage, GROUP).await?;
+    let finest = json(storage, FINEST).await?;
+    // Where neither is there, it was whole once, and has lost its description.
+    let finest = finest.and_then(|mut array| Some(array.pointer_mut(STATE)?.take()));
+    let begun = match group {
+        Some(_) => unfinished,
+        None => unfinished.or(finest),
+    };
+    if let Some(begun) = begun {
         if !plan::goes_on(&begun["export"], &ours["export"]) {
             let differences = plan::differences(&begun["export"], &ours["export"]);
             return Err(ExportError::Other { differences });
         }
         if begun["revision"] == ours["revision"] {
-            if begun != ours {
-                // From now on ids may become others.
-                storage.write_durable(UNFINISHED, pretty(&ours)).await?;
-            }
+            // Also where it was there: from now on ids may become others.
+            storage.write_durable(UNFINISHED, pretty(&ours)).await?;
             return Ok(Begun::Partly);
         }
         // It may have been whole but for the end of this object: no image while it is written anew.
@@ -429,7 +443,7 @@ async fn begin(
         // Not before these are gone: an attempt that ends here goes on from the revision that is told.
         storage.write_durable(UNFINISHED, pretty(&ours)).await?;
         return Ok(Begun::Partly);
-    } else if let Some(group) = json(storage, GROUP).await? {
+    } else if let Some(group) = group {
         let there = &group["attributes"][OURS];
         if !plan::goes_on(&there["export"], &ours["export"]) {
             return Err(ExportError::Exists);

@@ -128,3 +128,68 @@ fn a_volume_that_went_back_is_exported_anew() {
     exported(&earlier, &fresh).unwrap();
     assert!(image(&storage) == image(&fresh));
 }
+
+/// The root's description can be lost as anything can; what is exported is said beside the finest level, too.
+#[test]
+fn an_export_that_lost_its_root_goes_on() {
+    let source = Live::new(false);
+    source.set(VoxelBox::new(UVec3::ZERO, UVec3::splat(9)), 200);
+    let storage = MemoryStorage::new();
+    exported(&source, &storage).unwrap();
+    let whole = image(&storage);
+    for missing in [GROUP, "1/zarr.json"] {
+        run(storage.delete(missing)).unwrap();
+    }
+    let shards = run(storage.list("0/c/")).unwrap();
+    run(storage.delete(&shards[0])).unwrap();
+    let mended = exported(&source, &storage).unwrap();
+    assert_eq!((mended.was_whole, mended.again), (false, 0));
+    assert_eq!(mended.kept + mended.empty + 1, mended.shards, "{mended:?}");
+    assert!(image(&storage) == whole);
+    assert!(exported(&source, &storage).unwrap().was_whole);
+
+    // Not as another export, nor with what has changed since.
+    run(storage.delete(GROUP)).unwrap();
+    let volume: Arc<dyn VolumeSource> = source.clone();
+    let other = ExportOptions {
+        compression: 0,
+        ..ExportOptions::default()
+    };
+    let refused = run(export(&volume, &storage, &other, &|_| {})).unwrap_err();
+    assert!(
+        matches!(&refused, ExportError::Other { differences } if differences.contains("compression")),
+        "{refused:?}"
+    );
+    source.set(corner(), 77);
+    let outdated = touched(&source, corner()).len() as u64;
+    let done = exported(&source, &storage).unwrap();
+    assert_eq!(done.kept + done.empty + outdated, done.shards, "{done:?}");
+    let fresh = MemoryStorage::new();
+    exported(&source, &fresh).unwrap();
+    assert!(image(&storage) == image(&fresh));
+
+    // Where that is lost, too, or was never there, nobody knows what the shards are of.
+    for group in [GROUP, "0/zarr.json"] {
+        run(storage.delete(group)).unwrap();
+    }
+    let refused = exported(&source, &storage).unwrap_err();
+    assert!(matches!(refused, ExportError::Exists), "{refused:?}");
+}
+
+/// What earlier versions wrote says so in its root alone.
+#[test]
+fn an_export_whose_levels_do_not_say_what_they_are_of_is_whole() {
+    let source = Live::new(false);
+    source.set(VoxelBox::new(UVec3::ZERO, UVec3::splat(9)), 200);
+    let storage = MemoryStorage::new();
+    exported(&source, &storage).unwrap();
+    let said = run(storage.read("0/zarr.json", None)).unwrap();
+    let mut said: serde_json::Value = serde_json::from_slice(&said).unwrap();
+    assert!(said["attributes"][OURS].is_object());
+    said["attributes"] = serde_json::json!({});
+    run(storage.write_durable("0/zarr.json", pretty(&said))).unwrap();
+    assert!(exported(&source, &storage).unwrap().was_whole);
+    said["attributes"] = serde_json::json!({"note": "edited"});
+    run(storage.write_durable("0/zarr.json", pretty(&said))).unwrap();
+    assert!(!exported(&source, &storage).unwrap().was_whole);
+}
