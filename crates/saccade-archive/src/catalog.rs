@@ -36,6 +36,7 @@ mod location;
 mod origins;
 mod postgres;
 mod rows;
+mod spoilt;
 mod sqlite;
 mod watcher;
 mod workers;
@@ -60,6 +61,7 @@ pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
 pub use error::CatalogError;
 pub use location::CatalogLocation;
 pub use origins::Origin;
+pub use spoilt::{Listed, SpoiltTile};
 pub use workers::{Claim, HeldUp, Worker};
 
 /// Most changes that [`Catalog::changes_after`] returns at once.
@@ -389,60 +391,63 @@ impl Catalog {
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltVolume`], or what the database says.
     pub async fn entry(&self, name: &str) -> Result<VolumeEntry, CatalogError> {
-        let question = "SELECT description, revision, tiles FROM volumes WHERE name = $1";
-        let found = self
-            .ask(question, &[name.into()], rows::volume_entry)
-            .await?;
+        let question = "SELECT name, description, revision, tiles FROM volumes WHERE name = $1";
+        let described = |row: &Row| Ok(self.described(name, row));
+        let found = self.ask(question, &[name.into()], described).await?;
         match found.into_iter().next() {
-            Some(entry) => Ok(entry),
+            Some(entry) => entry,
             None => Err(self.unknown_volume(name).await),
         }
     }
 
-    /// All volumes, by name.
+    /// All volumes, by name, also those of which nothing else can be understood.
     ///
     /// # Errors
     ///
     /// What the database says.
-    pub async fn volumes(&self) -> Result<Vec<VolumeEntry>, CatalogError> {
-        let question = "SELECT description, revision, tiles FROM volumes ORDER BY name";
-        self.ask(question, &[], rows::volume_entry).await
+    pub async fn volumes(&self) -> Result<Vec<Listed>, CatalogError> {
+        let question = "SELECT name, description, revision, tiles FROM volumes ORDER BY name";
+        let listed = |row: &Row| {
+            let name: String = row.get("name")?;
+            let entry = self.described(&name, row);
+            Ok(Listed { name, entry })
+        };
+        self.ask(question, &[], listed).await
     }
 
     /// The tiles of a section, by id.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltTile`] where [`Self::section_rows`] has one, or what the
+    /// database says.
     pub async fn section_tiles(&self, volume: &str, z: u32) -> Result<Vec<Tile>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                        pyramid, revision FROM tiles \
-                        WHERE volume = $1 AND section = $2 AND deleted = 0 ORDER BY id";
-        self.ask(question, &[id.into(), z.into()], rows::tile).await
+        let rows = self.section_rows(volume, z).await?;
+        self.whole(volume, rows)
     }
 
     /// The tile of that name, if the volume has it.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltTile`], or what the database says.
     pub async fn tile(&self, volume: &str, name: &str) -> Result<Option<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
         let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
                         pyramid, revision FROM tiles \
                         WHERE volume = $1 AND name = $2 AND deleted = 0";
         let values = [id.into(), name.into()];
-        Ok(self.ask(question, &values, rows::tile).await?.pop())
+        let rows = self.ask(question, &values, rows::tile_or_spoilt).await?;
+        Ok(self.whole(volume, rows)?.pop())
     }
 
     /// The tiles of these ids, by id; those that the volume has not are left out.
     ///
     /// # Errors
     ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
+    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltTile`], or what the database says.
     pub async fn tiles(&self, volume: &str, ids: &[TileId]) -> Result<Vec<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
         let question = Statement {
@@ -456,8 +461,9 @@ impl Catalog {
                        AND volume = $2 AND deleted = 0 ORDER BY id",
         };
         let ids = serde_json::to_string(ids).expect("numbers become JSON");
-        self.ask(question, &[(&ids).into(), id.into()], rows::tile)
-            .await
+        let values = [(&ids).into(), id.into()];
+        let rows = self.ask(question, &values, rows::tile_or_spoilt).await?;
+        self.whole(volume, rows)
     }
 
     /// The sections that have a tile, ascending.

@@ -18,6 +18,7 @@ use crate::catalog::{CatalogError, Origin, Quarantined, Tile, VolumeEntry, Waiti
 use crate::pyramid::{self, PyramidError, Verified};
 use crate::storage::{Entry, StorageError};
 
+mod misplaced;
 #[cfg(test)]
 mod tests;
 
@@ -111,6 +112,8 @@ pub enum FindingKind {
     Misplaced,
     /// Two tiles name one pyramid.
     Shared,
+    /// What the catalog says of a tile or of a volume cannot be understood.
+    Spoilt,
     /// The catalog's counts are not those of its tiles.
     Miscounted,
     /// A pyramid that nothing names. Harmless, but it takes space.
@@ -177,8 +180,8 @@ pub enum CheckError {
 /// missing or damaged is given back to ingest if the acquisition still has its record and image,
 /// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
 /// damaged object: ingest replaces it. A folder in the place of a pyramid is found as damage and not repaired:
-/// somebody has to take it away first. Wrong counts are made right. A tile that lies outside of the volume is moved to
-/// where its records say, and of tiles that name one pyramid, those of whose records it was not made are given back to
+/// somebody has to take it away first. Wrong counts are made right. A tile that lies outside of the volume, or nowhere, is
+/// moved to where its records say, and of tiles that name one pyramid, those of whose records it was not made are given back to
 /// ingest.
 ///
 /// # Errors
@@ -191,7 +194,10 @@ pub async fn check(
 ) -> Result<CheckReport, CheckError> {
     let objects = archive.storage().entries("tiles/").await?;
     let volumes = archive.catalog().volumes().await?;
-    let total = volumes.iter().map(|v| v.tiles).sum();
+    let known = volumes
+        .iter()
+        .filter_map(|volume| volume.entry.as_ref().ok());
+    let total = known.map(|entry| entry.tiles).sum();
     let mut check = Check {
         archive,
         options,
@@ -202,9 +208,13 @@ pub async fn check(
         named: HashSet::new(),
         shared: HashSet::new(),
         given_back: HashSet::new(),
+        unknown: HashSet::new(),
     };
-    for volume in &volumes {
-        check.volume(volume).await?;
+    for volume in volumes {
+        match volume.entry {
+            Ok(entry) => check.volume(&entry).await?,
+            Err(error) => check.not_understood(volume.name, &error),
+        }
     }
     check.orphans(&objects).await?;
     let mut report = check.report;
@@ -228,6 +238,8 @@ struct Check<'a> {
     shared: HashSet<String>,
     /// Volume and name of tiles that were given back for that.
     given_back: HashSet<(String, String)>,
+    /// Volumes of whose tiles nothing is known.
+    unknown: HashSet<String>,
 }
 
 impl Check<'_> {
@@ -238,16 +250,22 @@ impl Check<'_> {
         // Not those that are counted: what the counts leave out would be called nobody's.
         let sections = catalog.sections_of_tiles(&volume.name).await?;
         for &z in &sections {
-            let tiles = catalog.section_tiles(&volume.name, z).await?;
-            let looks = tiles.into_iter().map(async |tile| {
-                let looked = self.look(&tile).await;
-                (tile, looked)
+            let tiles = catalog.section_rows(&volume.name, z).await?;
+            let looks = tiles.into_iter().map(async |tile| match tile {
+                Ok(tile) => {
+                    let looked = self.look(&tile).await;
+                    Ok((tile, looked))
+                }
+                Err(spoilt) => Err(spoilt),
             });
             let workers = self.options.workers.max(1);
             let looks: Vec<_> = stream::iter(looks).buffered(workers).collect().await;
-            for (tile, looked) in looks {
+            for tile in looks {
                 self.report.tiles += 1;
-                self.tile(entry, &tile, looked).await?;
+                match tile {
+                    Ok((tile, looked)) => self.tile(entry, &tile, looked).await?,
+                    Err(spoilt) => self.spoilt(entry, spoilt).await?,
+                }
             }
             (self.progress)(self.report.tiles, self.total);
         }
@@ -406,46 +424,6 @@ impl Check<'_> {
             reason,
             repair: None,
         })
-    }
-
-    /// A tile lies where no voxel is.
-    async fn misplaced(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<(), CheckError> {
-        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let mut reason = format!(
-            "it lies outside of the volume (section {}, transform {:?})",
-            tile.section,
-            tile.transform.elements()
-        );
-        let mut repair = None;
-        if self.options.repair {
-            let read = catalog.cursor(volume).await?;
-            let origins = catalog.origins(volume, &tile.pyramid).await?;
-            let origin = origins.into_iter().find(|origin| origin.tile == tile.name);
-            let said = origin.and_then(|origin| {
-                // The newest that leads anywhere.
-                let of = [origin.transform_position, origin.position];
-                let said = |at| match self.record_at(entry, at, read)?.1 {
-                    Record::Tile(record) if record.tile == tile.name => Some(record.transform),
-                    Record::Transform(record) if record.tile == tile.name => Some(record.transform),
-                    _ => None,
-                };
-                let extent = entry.volume.extent();
-                let inside = |to: &_| place(extent, tile.section, tile.size, *to).is_some();
-                of.into_iter().filter_map(said).find(inside)
-            });
-            if let Some(transform) = said {
-                catalog.set_transform(volume, &tile.name, transform).await?;
-                repair = Some(Repair::Moved);
-            } else {
-                reason.push_str(
-                    ", and no record is to be had that says where it lies: name the folder of the acquisition with \
-                     --acquisition, or say with `saccade update` where it lies, or that it is no more",
-                );
-            }
-        }
-        self.find(FindingKind::Misplaced, entry, Some(tile), reason)
-            .repair = repair;
-        Ok(())
     }
 
     /// A tile names a pyramid that one before it names, too. It was made of one record: the tiles of others are found.
@@ -611,7 +589,8 @@ impl Check<'_> {
     async fn orphans(&mut self, objects: &[Entry]) -> Result<(), CheckError> {
         let now = SystemTime::now();
         for object in objects {
-            if self.named.contains(&self.hasher.hash_one(&object.name)) {
+            let is_unknown = volume_of(&object.name).is_some_and(|v| self.unknown.contains(v));
+            if is_unknown || self.named.contains(&self.hasher.hash_one(&object.name)) {
                 continue;
             }
             let age = object.modified.and_then(|at| now.duration_since(at).ok());
@@ -676,6 +655,11 @@ impl Check<'_> {
             Err(error) => Err(error.into()),
         }
     }
+}
+
+/// The volume whose tile's a pyramid is.
+fn volume_of(pyramid: &str) -> Option<&str> {
+    Some(pyramid.strip_prefix("tiles/")?.split_once('/')?.0)
 }
 
 /// The position of the record that a pyramid was made of: ingest ends names with it.

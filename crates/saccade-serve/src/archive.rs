@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use saccade_archive::VisualizationArchive;
-use saccade_archive::catalog::{CatalogError, VolumeEntry};
+use saccade_archive::catalog::{CatalogError, Listed};
 use saccade_source::SourceError;
 use saccade_source::stitched::{StitchedOptions, StitchedSource};
 
@@ -35,15 +35,14 @@ pub async fn offer_archive(
     options: StitchedOptions,
 ) -> Result<Offer, CatalogError> {
     archive.catalog().follow();
-    let entries = archive.catalog().volumes().await?;
+    let listed = archive.catalog().volumes().await?;
     if archive.catalog().times_replaced() > 0 {
-        withdraw_others(volumes, &entries);
+        withdraw_others(volumes, &listed);
     }
     let offered = volumes.names();
-    volumes.keep_failing(|name| entries.iter().any(|entry| entry.volume.name == name));
+    volumes.keep_failing(|name| listed.iter().any(|volume| volume.name == name));
     let mut offer = Offer::default();
-    for entry in entries {
-        let name = entry.volume.name;
+    for Listed { name, .. } in listed {
         if offered.contains(&name) {
             continue;
         }
@@ -66,10 +65,11 @@ pub async fn offer_archive(
 }
 
 /// Offers no more what an archive has not, or has as another.
-fn withdraw_others(volumes: &Volumes, entries: &[VolumeEntry]) {
+fn withdraw_others(volumes: &Volumes, listed: &[Listed]) {
     for offered in volumes.all() {
         let volume = offered.volume();
-        let is_there = entries.iter().any(|entry| entry.volume == **volume);
+        let is = |listed: &Listed| matches!(&listed.entry, Ok(entry) if entry.volume == **volume);
+        let is_there = listed.iter().any(is);
         // What is not made of tiles is of no archive.
         if !is_there && offered.status.is_some() {
             let name = &volume.name;

@@ -237,7 +237,7 @@ impl StitchedSource {
         let news = match catalog.subscribe(name).await {
             Err(CatalogError::UnknownVolume { .. }) => {
                 let volumes = catalog.volumes().await.map_err(failed)?;
-                let known = volumes.into_iter().map(|v| v.volume.name).collect();
+                let known = volumes.into_iter().map(|volume| volume.name).collect();
                 let name = name.to_owned();
                 return Err(SourceError::NoVolume { name, known });
             }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
-use saccade_archive::catalog::CatalogError;
+use saccade_archive::catalog::{CatalogError, Listed};
 use saccade_archive::{
     ArchiveError, ArchiveLocation, CatalogLocation, StorageLocation, VisualizationArchive,
 };
@@ -206,6 +206,19 @@ fn neither_there(no_server: SourceError, no_image: &anyhow::Error) -> anyhow::Er
     anyhow::Error::from(no_server).context(both)
 }
 
+/// The first volume of an archive that can be opened, and tells of those that cannot; the first where none can.
+async fn first(archive: &VisualizationArchive) -> Result<Option<String>> {
+    let mut first = None;
+    for Listed { name, entry } in archive.catalog().volumes().await? {
+        match entry {
+            Ok(_) => return Ok(Some(name)),
+            Err(error) => say(&error.to_string()),
+        }
+        first.get_or_insert(name);
+    }
+    Ok(first)
+}
+
 /// An open volume, and who knows how its acquisition is coming along.
 pub(crate) struct Opened {
     pub(crate) source: Arc<dyn VolumeSource>,
@@ -288,12 +301,9 @@ impl Place {
                 let options = stitching.options(&location).await?;
                 let name = match name {
                     Some(name) => name.to_owned(),
-                    None => match archive.catalog().volumes().await?.into_iter().next() {
-                        Some(entry) => entry.volume.name,
-                        None => bail!(
-                            "the archive holds no volumes yet; `saccade ingest` fills it: {location}"
-                        ),
-                    },
+                    None => first(&archive).await?.with_context(|| {
+                        format!("the archive holds no volumes yet; `saccade ingest` fills it: {location}")
+                    })?,
                 };
                 let source = StitchedSource::open(&archive, &name, options)
                     .await

@@ -69,9 +69,10 @@ struct Existing {
     id: TileId,
     deleted: bool,
     section: u32,
-    /// `None` if it is outside, or deleted.
+    /// `None` if it is outside, deleted, or nowhere.
     place: Option<VoxelBox>,
-    transform: SectionFromTile,
+    /// `None` if what the catalog says is none: the next record that says where it lies mends that.
+    transform: Option<SectionFromTile>,
     size: glam::UVec2,
     pyramid: String,
     position: u64,
@@ -83,8 +84,8 @@ impl<'c> Commit<'c> {
         let mut transaction = catalog.transaction(Durability::Durable).await?;
         // Whoever comes later waits here, so that revisions follow one another.
         let question = Statement {
-            sqlite: "SELECT id, description, revision, tiles FROM volumes WHERE name = $1",
-            postgres: "SELECT id, description, revision, tiles FROM volumes WHERE name = $1 \
+            sqlite: "SELECT id, name, description, revision, tiles FROM volumes WHERE name = $1",
+            postgres: "SELECT id, name, description, revision, tiles FROM volumes WHERE name = $1 \
                        FOR NO KEY UPDATE",
         };
         let row = transaction.one(question, &[volume.into()]).await;
@@ -92,7 +93,7 @@ impl<'c> Commit<'c> {
             drop(transaction);
             return Err(catalog.unknown_volume(volume).await);
         };
-        let entry = rows::volume_entry(&row).map_err(|e| catalog.failed(e))?;
+        let entry = catalog.described(volume, &row)?;
         Ok(Self {
             catalog,
             transaction,
@@ -135,12 +136,12 @@ impl<'c> Commit<'c> {
             None
         };
         // The newest record says where the tile lies.
-        let (transform, transform_position) = match (&existing, early) {
-            (Some(e), _) if e.transform_position > tile.position => {
-                (e.transform, e.transform_position)
-            }
+        let newer = { existing.as_ref() }.filter(|e| e.transform_position > tile.position);
+        let newer = newer.and_then(|e| Some((e.transform?, e.transform_position)));
+        let (transform, transform_position) = match (newer, early) {
+            (Some(newer), _) => newer,
             (None, Some((transform, position))) => (transform, position.max(tile.position)),
-            _ => (tile.transform, tile.position),
+            (None, None) => (tile.transform, tile.position),
         };
         let place = self.place(&tile.name, tile.section, tile.size, transform)?;
         let id = match known {
@@ -212,7 +213,7 @@ impl<'c> Commit<'c> {
         }
         let place = self.place(tile, existing.section, existing.size, transform)?;
         self.end_misplacement(tile).await?;
-        let moved = existing.transform != transform;
+        let moved = existing.transform != Some(transform);
         if moved {
             let reason = ChangeReason::Transform;
             self.log_change(existing.id, existing.place, Some(place), reason)
@@ -282,8 +283,10 @@ impl<'c> Commit<'c> {
                     .await?;
                 *self.sections.entry(e.section).or_default() -= 1;
                 self.retire(&e.pyramid, now).await?;
-                if e.transform_position > position {
-                    self.keep_early(tile, e.transform, e.transform_position)
+                if let Some(transform) = e.transform
+                    && e.transform_position > position
+                {
+                    self.keep_early(tile, transform, e.transform_position)
                         .await?;
                 }
                 (e.id, DeleteOutcome::Deleted)
@@ -583,16 +586,14 @@ impl<'c> Commit<'c> {
         let extent = self.extent;
         let decode = || {
             let deleted = row.get::<i64>("deleted")? != 0;
-            let (section, size, transform) = (
-                rows::section(&row)?,
-                rows::size(&row)?,
-                rows::transform(&row)?,
-            );
+            let (section, size) = (rows::section(&row)?, rows::size(&row)?);
+            let transform = rows::transform(&row).ok();
+            let at = transform.filter(|_| !deleted);
             Ok(Existing {
                 id: TileId(row.get("id")?),
                 deleted,
                 section,
-                place: place(extent, section, size, transform).filter(|_| !deleted),
+                place: at.and_then(|at| place(extent, section, size, at)),
                 transform,
                 size,
                 pyramid: row.get("pyramid")?,

@@ -162,6 +162,35 @@ pub enum CatalogError {
         /// As asked for.
         asked: String,
     },
+    /// The catalog's row of a volume means nothing.
+    #[error(
+        "what the catalog says of volume {name:?} cannot be understood ({reason}): put a copy of the catalog in its place, \
+         from which `saccade ingest` goes on and `saccade check` says what it lacks; other volumes can be used as they \
+         are: {location}"
+    )]
+    SpoiltVolume {
+        /// The volume.
+        name: String,
+        /// What is wrong.
+        reason: String,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// The catalog's row of a tile means nothing.
+    #[error(
+        "what the catalog says of tile {tile:?} of volume {volume:?} cannot be understood ({reason}): `saccade check \
+         --repair` mends it from the acquisition's records: {location}"
+    )]
+    SpoiltTile {
+        /// The tile.
+        tile: String,
+        /// Its volume.
+        volume: String,
+        /// What is wrong.
+        reason: String,
+        /// Where it is.
+        location: CatalogLocation,
+    },
     /// A tile would lie where no voxel is.
     #[error(
         "tile {tile:?} would lie wholly outside the volume of {extent} voxels (section {section}, \
@@ -334,6 +363,8 @@ impl CatalogError {
             | Self::Damaged { location, .. }
             | Self::Moved { location }
             | Self::Away { location, .. }
+            | Self::SpoiltVolume { location, .. }
+            | Self::SpoiltTile { location, .. }
             | Self::Database { location, .. } => Some(location),
             Self::Missed { .. }
             | Self::UnknownVolume { .. }

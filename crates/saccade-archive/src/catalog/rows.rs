@@ -4,13 +4,14 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use glam::{UVec2, UVec3};
 use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use sqlx::Error;
 
 use super::database::Row;
 use super::{
-    CatalogChange, ChangeReason, Claim, HeldUp, Origin, Quarantined, Retired, Statistics, Tile,
-    TileId, VolumeEntry, Waiting,
+    CatalogChange, ChangeReason, Claim, HeldUp, Origin, Quarantined, Retired, SpoiltTile,
+    Statistics, Tile, TileId, VolumeEntry, Waiting,
 };
 use crate::acquisition::Cursor;
 
@@ -45,7 +46,7 @@ pub(super) fn transform(row: &Row) -> Result<SectionFromTile, Error> {
     for (element, column) in elements.iter_mut().zip(["a", "b", "c", "d", "tx", "ty"]) {
         *element = row.get(column)?;
     }
-    SectionFromTile::new(elements).map_err(|e| decode("a", e))
+    SectionFromTile::new(elements).map_err(|e| decode("a to ty", e))
 }
 
 pub(super) fn size(row: &Row) -> Result<UVec2, Error> {
@@ -58,21 +59,68 @@ pub(super) fn section(row: &Row) -> Result<u32, Error> {
 
 pub(super) fn volume_entry(row: &Row) -> Result<VolumeEntry, Error> {
     let description: String = row.get("description")?;
+    let volume: Volume =
+        serde_json::from_str(&description).map_err(|e| decode("description", e))?;
+    if let Some(reason) = impossible(&volume, &row.get::<String>("name")?) {
+        return Err(decode("description", reason));
+    }
     Ok(VolumeEntry {
-        volume: serde_json::from_str(&description).map_err(|e| decode("description", e))?,
+        volume,
         revision: unsigned(row, "revision")?,
         tiles: unsigned(row, "tiles")?,
     })
 }
 
-pub(super) fn tile(row: &Row) -> Result<Tile, Error> {
+/// What of a volume cannot be so, and others rely on.
+fn impossible(volume: &Volume, name: &str) -> Option<String> {
+    let sizes = volume.levels.iter().map(|level| level.extent);
+    let mut sizes = sizes.chain([volume.chunk]);
+    let wrong = match () {
+        () if volume.name != name => return Some(format!("it is of a volume {:?}", volume.name)),
+        () if volume.levels.is_empty() => "it has no levels",
+        () if volume.channels.is_empty() => "it has no channels",
+        () if sizes.any(|size| size.min_element() == 0) => "a level or its chunks have no voxels",
+        () => return None,
+    };
+    Some(wrong.to_owned())
+}
+
+/// What is wrong with a value, in brief.
+pub(super) fn reason_of(error: Error) -> String {
+    match error {
+        Error::ColumnDecode { index, source } => format!("{index}: {source}"),
+        other => other.to_string(),
+    }
+}
+
+pub(super) fn tile_or_spoilt(row: &Row) -> Result<Result<Tile, SpoiltTile>, Error> {
+    let error = match tile(row) {
+        Ok(tile) => return Ok(Ok(tile)),
+        Err(error) => error,
+    };
+    // Put anywhere, it is one: then only where it lies cannot be.
+    let elsewhere = tile_at(row, SectionFromTile::IDENTITY).ok();
+    Ok(Err(SpoiltTile {
+        name: row.get("name")?,
+        section: section(row)?,
+        pyramid: row.get("pyramid")?,
+        reason: reason_of(error),
+        size: elsewhere.map(|tile| tile.size),
+    }))
+}
+
+fn tile(row: &Row) -> Result<Tile, Error> {
+    tile_at(row, transform(row)?)
+}
+
+fn tile_at(row: &Row, transform: SectionFromTile) -> Result<Tile, Error> {
     Ok(Tile {
         id: TileId(row.get("id")?),
         name: row.get("name")?,
         section: section(row)?,
         channel: small(row, "channel")?,
         size: size(row)?,
-        transform: transform(row)?,
+        transform,
         pyramid: row.get("pyramid")?,
         revision: unsigned(row, "revision")?,
     })

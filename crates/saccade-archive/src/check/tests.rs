@@ -462,6 +462,132 @@ async fn tiles_outside_of_the_volume_are_moved_to_where_their_records_say() {
     assert_eq!(fixture.check(false).await.findings, []);
 }
 
+/// Rows that only a damaged file, or somebody's hand, can make so.
+#[tokio::test]
+async fn tiles_that_lie_nowhere_are_found_beside_others_and_moved_to_where_their_records_say() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture
+        .meddle(&[
+            "UPDATE tiles SET a = 0, b = 0 WHERE name = 't2'",
+            "UPDATE tiles SET revision = -1 WHERE name = 't4'",
+        ])
+        .await;
+    let told = catalog.tile(VOLUME, "t2").await.unwrap_err();
+    let told = told.to_string();
+    for word in ["\"t2\"", "cannot be inverted", "saccade check --repair"] {
+        assert!(told.contains(word), "{told}");
+    }
+    fs::remove_file(fixture.path(3)).unwrap();
+    let of = |kind, n: u32| (kind, format!("t{n}"));
+    let mut options = CheckOptions {
+        repair: true,
+        safe_age: Duration::ZERO,
+        ..CheckOptions::default()
+    };
+    // Of t3 it is said that it is missing, for it was looked at, too.
+    for (acquisition, repaired) in [
+        (None, [None, Some(Repair::Quarantined), None]),
+        (
+            Some(fixture.acquisition.path().to_owned()),
+            [Some(Repair::Moved), Some(Repair::Queued), None],
+        ),
+    ] {
+        options.acquisition = acquisition;
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let found: Vec<_> = { report.findings.iter() }
+            .map(|f| {
+                of(
+                    f.kind,
+                    f.tile.as_ref().map_or(9, |t| t[1..].parse().unwrap()),
+                )
+            })
+            .collect();
+        let want = [
+            of(FindingKind::Spoilt, 2),
+            of(FindingKind::Missing, 3),
+            of(FindingKind::Spoilt, 4),
+        ];
+        assert_eq!(found, want);
+        assert_eq!(report.tiles, u64::from(TILES));
+        let repairs: Vec<_> = report.findings.iter().map(|f| f.repair).collect();
+        assert_eq!(repairs, repaired);
+        for (n, word) in [(0, "cannot be inverted"), (2, "once more")] {
+            let reason = &report.findings[n].reason;
+            assert!(reason.contains(word), "{reason}");
+        }
+    }
+    let moved = catalog.tile(VOLUME, "t2").await.unwrap().unwrap();
+    assert_eq!(
+        moved.transform,
+        SectionFromTile::translation(DVec2::splat(3.0))
+    );
+    // What the other needs: its record once more.
+    let tile = NewTile {
+        name: "t4".to_owned(),
+        section: 2,
+        channel: 0,
+        size: UVec2::new(200, 150),
+        transform: moved.transform,
+        pyramid: fixture.names[4].clone(),
+        position: 1 << 20,
+    };
+    catalog.commit_tile(VOLUME, &tile).await.unwrap();
+    let found = fixture.check(false).await.findings;
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert_eq!(found[0].kind, FindingKind::Missing);
+}
+
+#[tokio::test]
+async fn volumes_that_cannot_be_understood_are_told_and_nothing_of_theirs_is_deleted() {
+    let other = Volume::new("w", UVec3::splat(64), DVec3::ONE).unwrap();
+    for spoilt in [
+        "'?' || description",
+        "replace(description, '\"v\"', '\"u\"')",
+        "json_set(description, '$.levels', json('[]'))",
+        "json_set(description, '$.channels', json('[]'))",
+        "json_set(description, '$.chunk', json('[64,0,64]'))",
+    ] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        catalog.create_volume(&other).await.unwrap();
+        let statement = format!("UPDATE volumes SET description = {spoilt} WHERE name = 'v'");
+        fixture.meddle(&[&statement]).await;
+        let listed = catalog.volumes().await.unwrap();
+        let listed: Vec<_> = { listed.into_iter() }
+            .map(|listed| (listed.name, listed.entry.ok().map(|entry| entry.volume)))
+            .collect();
+        let want = [
+            ("v".to_owned(), None),
+            ("w".to_owned(), Some(other.clone())),
+        ];
+        assert_eq!(listed, want, "{spoilt}");
+        let entry = catalog.entry(VOLUME).await.unwrap_err();
+        let begun = catalog.begin(VOLUME).await.unwrap_err();
+        for error in [entry, begun] {
+            assert!(
+                matches!(&error, CatalogError::SpoiltVolume { name, .. } if name == "v"),
+                "{error}"
+            );
+        }
+        let options = CheckOptions {
+            repair: true,
+            safe_age: Duration::ZERO,
+            ..CheckOptions::default()
+        };
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let [found] = &report.findings[..] else {
+            panic!("{spoilt}: {:?}", report.findings);
+        };
+        assert_eq!(
+            (found.kind, found.volume.as_deref(), found.repair),
+            (FindingKind::Spoilt, Some("v"), None)
+        );
+        assert_eq!(report.damage(), 1);
+        assert!((0..6).all(|n| fixture.path(n).is_file()), "{spoilt}");
+    }
+}
+
 #[tokio::test]
 async fn who_names_anothers_pyramid_gets_one_of_its_own() {
     // Of those that share it, the owner is the first or the last that is met; or it is nobody's.

@@ -580,7 +580,7 @@ pub(crate) async fn other_sizes_and_unknown_names_are_refused(place: &Place) {
         );
     }
     let volumes = catalog.volumes().await.unwrap();
-    let names: Vec<_> = volumes.into_iter().map(|e| e.volume.name).collect();
+    let names: Vec<_> = volumes.into_iter().map(|listed| listed.name).collect();
     assert_eq!(names, ["v"]);
 }
 

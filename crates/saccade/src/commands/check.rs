@@ -87,6 +87,7 @@ fn name(kind: FindingKind) -> &'static str {
         FindingKind::Mistaken => "mistaken",
         FindingKind::Misplaced => "misplaced",
         FindingKind::Shared => "shared",
+        FindingKind::Spoilt => "spoilt",
         FindingKind::Miscounted => "miscounted",
         FindingKind::Orphan => "orphan",
         _ => "wrong",

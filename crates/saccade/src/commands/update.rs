@@ -55,7 +55,7 @@ fn lines(path: &Path) -> Result<Vec<Line>> {
 /// The only volume.
 async fn only(catalog: &Catalog) -> Result<String> {
     let volumes = catalog.volumes().await?;
-    let mut names: Vec<_> = volumes.into_iter().map(|entry| entry.volume.name).collect();
+    let mut names: Vec<_> = volumes.into_iter().map(|volume| volume.name).collect();
     match &names[..] {
         [_] => Ok(names.remove(0)),
         [] => bail!("the archive holds no volumes yet; `saccade ingest` fills it"),
