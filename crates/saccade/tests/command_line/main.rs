@@ -4,6 +4,7 @@
 
 mod answers;
 mod catalog_replaced;
+mod damaged_tiles;
 mod demo;
 mod errors;
 mod export_power_cuts;
