@@ -1,6 +1,9 @@
 //! A source, a renderer and the pull between them.
 
+mod hidden;
 mod memory;
+mod shown;
+mod status;
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::fmt;
@@ -9,31 +12,26 @@ use std::time::Duration;
 
 use glam::UVec2;
 use saccade_core::brick::BrickId;
-use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
-    BrickVoxels, ChannelError, ChannelView, Delivery, Fidelity, FrameReport, Gpu, MemoryUse,
-    Renderer, RendererError, Statistics, View,
+    BrickVoxels, ChannelError, ChannelView, Delivery, FrameReport, Gpu, Renderer, RendererError,
+    View,
 };
 use saccade_source::{ChunkId, ValueRange, VolumeSource};
 
-use crate::brick::{chunks_of, range_of};
 use crate::channels::{self, Channel};
 use crate::clock::Clock;
 use crate::detail::{Content, Detail};
 use crate::histogram::Sample;
-use crate::host_cache::is_touched;
 use crate::policy::{Limits, Pace, Refresh, Retry};
-use crate::pull::{Freshness, Progress, Pull};
+use crate::pull::{Freshness, Pull};
 use crate::requests::{Event, Requests};
 pub use memory::TooLarge;
+pub use status::{Again, Status};
 
 /// Bricks whose bounds were told, kept in mind; beyond, all are forgotten and told again.
 const MOST_TOLD: usize = 1 << 16;
-
-/// Chunks whose bounds are looked up together.
-const RANGES_TOGETHER: usize = 128;
 
 /// Called, from any thread, when [`Session::frame`] would find something new.
 pub type Wake = Arc<dyn Fn() + Send + Sync>;
@@ -100,57 +98,6 @@ pub enum SessionError {
     },
 }
 
-/// When to call [`Session::frame`] again, if nobody wakes the caller before.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Again {
-    /// With the next frame of the display.
-    Now,
-    /// After this time.
-    After(Duration),
-    /// Only when woken, or when the view changes.
-    WhenWoken,
-}
-
-/// How the picture and the pull are.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Status {
-    /// Frames drawn so far.
-    pub frame: u64,
-    /// Whether this call drew one.
-    pub drew: bool,
-    /// Whether the last frame drawn is known to hold everything it wanted, up to date.
-    pub complete: bool,
-    /// Whether nothing will change by itself: no data on the way, no frame being drawn. An
-    /// incomplete picture that is settled misses bricks that failed for good.
-    pub settled: bool,
-    /// Of the newest frame known about.
-    pub fidelity: Fidelity,
-    /// Level-of-detail bias in force in it.
-    pub lod_bias: f32,
-    /// The part of it that lack of GPU memory added.
-    pub memory_bias: f32,
-    /// Work of the newest frame known about.
-    pub statistics: Statistics,
-    /// GPU memory.
-    pub memory: MemoryUse,
-    /// Memory that chunks take \[bytes\].
-    pub host_bytes: u64,
-    /// Requests and failures.
-    pub progress: Progress,
-    /// Bricks handed to the renderer so far.
-    pub delivered: u64,
-    /// The volume's revision after the newest change seen: the picture is to show it.
-    pub revision: u64,
-    /// From submission of the newest frame known about until it was known.
-    pub frame_time: Option<Duration>,
-    /// Size of that frame \[pixels\].
-    pub frame_size: UVec2,
-    /// Whether the GPU is gone: [`Session::set_gpu`] goes on with another.
-    pub lost: bool,
-    /// When to call again.
-    pub again: Again,
-}
-
 /// A volume being shown. Methods are called inside of a Tokio runtime's context natively.
 pub struct Session {
     renderer: Renderer,
@@ -199,13 +146,6 @@ struct Submitted {
     frame: u64,
     at: Duration,
     size: UVec2,
-}
-
-/// How long until it is worth looking whether the GPU has finished a frame, when the last one took
-/// `frame_time`.
-fn poll_after(frame_time: Option<Duration>) -> Duration {
-    let quarter = frame_time.unwrap_or_default() / 4;
-    quarter.clamp(Duration::from_millis(4), Duration::from_millis(50))
 }
 
 impl Session {
@@ -297,115 +237,6 @@ impl Session {
     /// What draws: its output, its memory.
     pub fn renderer(&self) -> &Renderer {
         &self.renderer
-    }
-
-    /// How each channel of the volume is shown.
-    pub fn channels(&self) -> &[Channel] {
-        &self.channels
-    }
-
-    /// Shows or hides a channel.
-    ///
-    /// # Errors
-    ///
-    /// [`ChannelError`] for a channel that the volume does not have, and when too many would be seen.
-    pub fn set_visible(&mut self, channel: u32, visible: bool) -> Result<(), ChannelError> {
-        let before = self.channel_mut(channel)?.visible;
-        self.channel_mut(channel)?.visible = visible;
-        if let Err(error) = self.put_channels() {
-            self.channel_mut(channel)?.visible = before;
-            return Err(error);
-        }
-        if visible && !before {
-            // Nobody may have counted its values.
-            self.refresh.changed();
-        }
-        self.is_awaited();
-        Ok(())
-    }
-
-    /// Sets a channel's colours and opacities; they no longer follow the histogram.
-    ///
-    /// # Errors
-    ///
-    /// [`ChannelError::NoSuchChannel`].
-    pub fn set_transfer_function(
-        &mut self,
-        channel: u32,
-        transfer: TransferFunction,
-    ) -> Result<(), ChannelError> {
-        let of = self.channel_mut(channel)?;
-        (of.transfer, of.automatic) = (transfer, false);
-        self.put_channels()?;
-        self.is_awaited();
-        Ok(())
-    }
-
-    /// Sets the value of a channel's surface, `[0, 1]`, for where surfaces are drawn; `None` lets it follow the
-    /// opacities.
-    ///
-    /// # Errors
-    ///
-    /// [`ChannelError::NoSuchChannel`].
-    pub fn set_iso(&mut self, channel: u32, iso: Option<f32>) -> Result<(), ChannelError> {
-        self.channel_mut(channel)?.iso = iso;
-        self.put_channels()?;
-        self.is_awaited();
-        Ok(())
-    }
-
-    /// Sets how finely a channel is drawn.
-    ///
-    /// # Errors
-    ///
-    /// [`ChannelError::NoSuchChannel`].
-    pub fn set_detail(&mut self, channel: u32, detail: Detail) -> Result<(), ChannelError> {
-        let of = self.channel_mut(channel)?;
-        let by_content = detail == Detail::ByContent;
-        (of.detail, of.finest_needed) = (detail, 0);
-        if by_content {
-            let needed = self.contents[channel as usize].finest_needed();
-            self.channel_mut(channel)?.finest_needed = needed;
-        }
-        self.put_channels()?;
-        self.is_awaited();
-        Ok(())
-    }
-
-    /// Lets a channel's colours and opacities follow the histogram, as they do at first.
-    ///
-    /// # Errors
-    ///
-    /// [`ChannelError::NoSuchChannel`].
-    pub fn set_automatic_transfer_function(&mut self, channel: u32) -> Result<(), ChannelError> {
-        let volume = self.volume().clone();
-        let of = self.channel_mut(channel)?;
-        of.follow_histogram(&volume, channel as usize);
-        self.put_channels()
-    }
-
-    fn channel_mut(&mut self, channel: u32) -> Result<&mut Channel, ChannelError> {
-        let channels = u32::try_from(self.channels.len()).unwrap_or(u32::MAX);
-        let of = self.channels.get_mut(channel as usize);
-        of.ok_or(ChannelError::NoSuchChannel { channel, channels })
-    }
-
-    /// Somebody waits for the picture, as for another view.
-    fn is_awaited(&mut self) {
-        self.drawn_view = None;
-    }
-
-    /// Tells the renderer how channels are shown, if that changed.
-    fn put_channels(&mut self) -> Result<(), ChannelError> {
-        let views = channels::views(&self.channels);
-        if self.views != views {
-            self.renderer.set_channels(&views)?;
-            self.views = views;
-            // What was hidden may be seen, and the renderer may have forgotten what it knew.
-            self.told.clear();
-            self.dirty = true;
-        }
-        Ok(())
     }
 
     /// Takes what arrived, asks for what is missing, draws if the picture would change.
@@ -539,90 +370,6 @@ impl Session {
         self.want_missed();
     }
 
-    /// Forgets the bounds of what changed. What changes again and again is not waited for.
-    fn forget_ranges(&mut self, voxels: VoxelBox) {
-        let volume = self.renderer.volume();
-        let touched = |chunk: &ChunkId| is_touched(*chunk, volume, voxels);
-        self.ranges.retain(|chunk, _| !touched(chunk));
-        if self.searched.1.iter().any(touched) {
-            if self.lost.len() > MOST_TOLD {
-                self.lost.clear();
-            }
-            let (bricks, _) = std::mem::take(&mut self.searched);
-            self.lost.extend(bricks);
-            self.requests.drop_ranges();
-        }
-    }
-
-    /// Wants what the newest report misses, but for what is hidden, or may be as far as is known.
-    fn want_missed(&mut self) {
-        let Some(report) = &self.report else {
-            return;
-        };
-        let (frame, misses) = (report.frame, report.misses.clone());
-        // What a frame does not know yet it misses.
-        let knows = report.octree_is_current.then_some(frame);
-        let (hidden, unknown) = self.hidden(&misses, knows);
-        let seen = misses.into_iter();
-        let seen = seen.filter(|id| !hidden.contains(id) && !unknown.contains(id));
-        self.pull.want(frame, &seen.collect::<Vec<_>>());
-        // Without what is hidden, the next frame may be complete.
-        self.dirty |= !hidden.is_empty();
-    }
-
-    /// Of the bricks missed, those that the source knows to hold nothing that can be seen, and those of
-    /// which that is being looked up. The renderer is told of the former, once: a brick that is missed
-    /// again, by a frame that knows, is needed.
-    fn hidden(
-        &mut self,
-        misses: &[BrickId],
-        knows: Option<u64>,
-    ) -> (HashSet<BrickId>, HashSet<BrickId>) {
-        if self.told.len() > MOST_TOLD {
-            self.told.clear();
-        }
-        let volume = self.renderer.volume().clone();
-        let (mut hidden, mut unknown) = (HashSet::new(), HashSet::new());
-        let (mut bricks, mut chunks) = (HashSet::new(), Vec::new());
-        let mut seen = HashSet::new();
-        for &id in misses {
-            if let Some(told) = self.told.get(&id) {
-                if told.is_some_and(|first| knows.is_none_or(|frame| frame < first)) {
-                    hidden.insert(id);
-                }
-                continue;
-            }
-            let (ranges, requests) = (&self.ranges, &self.requests);
-            let known = |chunk| {
-                let at_hand = || requests.value_range(chunk).map(Some);
-                ranges.get(&chunk).copied().or_else(at_hand)
-            };
-            let range = range_of(id, &volume, known);
-            let lost = self.lost.contains(&id);
-            if range.is_none() && !lost && self.renderer.may_hide(id.channel()) {
-                if chunks.len() < RANGES_TOGETHER {
-                    let new = chunks_of(id, &volume).filter(|chunk| known(*chunk).is_none());
-                    chunks.extend(new.filter(|chunk| seen.insert(*chunk)));
-                    bricks.insert(id);
-                }
-                unknown.insert(id);
-                continue;
-            }
-            let hides = range
-                .flatten()
-                .is_some_and(|range| self.renderer.note_range(id, [range.min, range.max]));
-            if hides {
-                hidden.insert(id);
-            }
-            self.told.insert(id, hides.then_some(self.drawn + 1));
-        }
-        if !chunks.is_empty() && !self.requests.is_finding() {
-            self.requests.find_ranges(chunks.clone());
-            self.searched = (bricks, chunks);
-        }
-        (hidden, unknown)
-    }
-
     /// Hands ready bricks to the renderer; whether there may be more.
     fn deliver(&mut self) -> bool {
         let (renderer, clock) = (&mut self.renderer, self.clock);
@@ -660,52 +407,6 @@ impl Session {
             }
         }
         delivery.cut
-    }
-
-    fn status(&self, now: Duration, drew: bool, cut: bool, draws_at: Option<Duration>) -> Status {
-        let mut progress = self.pull.progress();
-        if let Some(too_large) = self.too_large {
-            progress.failure = Some(too_large.to_string());
-        }
-        let report = self.report.as_ref();
-        let known = self.pending.is_empty() && !self.dirty;
-        let searching = self.requests.is_sampling() || self.requests.is_finding();
-        let idle = progress.wanted == 0 && !searching;
-        // While frames are being drawn, their end is awaited before the next.
-        let draws_at = draws_at.filter(|_| self.pending.is_empty());
-        let due = [progress.retry_at, self.refresh.due(), draws_at];
-        let due = due
-            .into_iter()
-            .flatten()
-            .min()
-            .map(|at| at.saturating_sub(now));
-        let poll = (!self.pending.is_empty()).then(|| poll_after(self.frame_time));
-        let next = due.into_iter().chain(poll).min();
-        let again = match next {
-            _ if cut => Again::Now,
-            Some(Duration::ZERO) => Again::Now,
-            Some(time) => Again::After(time),
-            None => Again::WhenWoken,
-        };
-        Status {
-            frame: self.drawn,
-            drew,
-            complete: known && report.is_some_and(FrameReport::is_complete),
-            settled: (known && idle && self.refresh.due().is_none()) || self.too_large.is_some(),
-            fidelity: report.map(|r| r.fidelity).unwrap_or_default(),
-            lod_bias: report.map_or(0.0, |r| r.lod_bias),
-            memory_bias: report.map_or(0.0, |r| r.memory_bias),
-            statistics: report.map(|r| r.statistics).unwrap_or_default(),
-            memory: self.renderer.memory(),
-            host_bytes: self.pull.host_bytes(),
-            progress,
-            delivered: self.delivered,
-            revision: self.revision,
-            frame_time: self.frame_time,
-            frame_size: self.frame_size,
-            lost: self.renderer.gpu().is_lost(),
-            again,
-        }
     }
 
     /// Reports of all frames drawn so far, once they are drawn.

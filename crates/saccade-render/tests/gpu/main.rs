@@ -8,6 +8,7 @@
 
 mod behaviour;
 mod channels;
+mod extremes;
 mod false_colors;
 mod functions;
 mod fuzz;
@@ -16,4 +17,5 @@ mod modes;
 mod octree;
 mod oracle;
 mod pictures;
+mod residency;
 mod scene;
