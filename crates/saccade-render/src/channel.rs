@@ -66,6 +66,20 @@ pub enum ChannelError {
         /// How many can be.
         most: usize,
     },
+    /// More than there is memory for, even where each is drawn from its coarsest level.
+    #[error(
+        "{got} channels do not fit {ceiling} bytes of GPU memory together; allow {needed} or more, or show {most} at most"
+    )]
+    Memory {
+        /// How many were asked for.
+        got: usize,
+        /// How many fit.
+        most: usize,
+        /// The ceiling in force \[bytes\].
+        ceiling: u64,
+        /// One that would do \[bytes\].
+        needed: u64,
+    },
 }
 
 /// Whether these can be seen together.

@@ -1,6 +1,7 @@
 //! The frame loop.
 
 mod deliveries;
+mod fit;
 #[cfg(test)]
 mod tests;
 
@@ -9,7 +10,6 @@ use std::sync::Arc;
 
 use glam::{UVec2, Vec2};
 use saccade_core::brick::BrickId;
-use saccade_core::page_table::{PageTableShape, PageTables};
 use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Polarity, Volume, VoxelKind};
 
@@ -17,20 +17,19 @@ use crate::channel::{self, ChannelError, ChannelView};
 use crate::frame::{Scene, Seen, false_colors_of, frame_uniform, is_far, mode_of};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
-use crate::layout::{MOST_CHANNELS, Variant};
-use crate::memory::plan::{DeviceLimits, Misfit, Needs, OctreeSize, Plan, READBACKS};
+use crate::layout::Variant;
+use crate::memory::plan::{Plan, READBACKS};
 use crate::memory::pressure::Pressure;
 use crate::memory::{Frame, VirtualMemory, Want};
-use crate::octree::{Geometry, ResidencyOctree, default_cell};
-use crate::options::{RendererError, RendererOptions, Traversal};
+use crate::octree::ResidencyOctree;
+use crate::options::{RendererError, RendererOptions};
 use crate::readback::{self, Staging};
 use crate::report::{FrameReport, MemoryUse, RawReport};
 use crate::resources::{Picture, Resources};
 use crate::transfer_table::{TransferTable, bins_of, largest};
 use crate::view::{Mode, View};
+use fit::{Planned, needs, planned};
 
-/// Storage buffers the ray-caster binds.
-const STORAGE_BUFFERS: u64 = 6;
 /// Bytes of a pixel of the picture.
 const PIXEL_BYTES: u32 = 4;
 /// Page table blocks made for one report; the others come with the next.
@@ -117,7 +116,7 @@ impl Renderer {
             octree,
             octree_slots,
             plan,
-        } = planned(gpu, &volume, &options)?;
+        } = planned(gpu, &volume, &options, 1)?;
         let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
         let bands = options.bands.max(1);
         let format = BrickFormat::new(volume.dtype, gpu.device().features(), options.split_16_bit);
@@ -190,12 +189,16 @@ impl Renderer {
     ///
     /// # Errors
     ///
-    /// [`ChannelError`] for channels that cannot be seen together; nothing changes then.
+    /// [`ChannelError`] for channels that cannot be seen together, or for which there is not enough memory even where each is
+    /// drawn from its coarsest level; nothing changes then.
     pub fn set_channels(&mut self, views: &[ChannelView]) -> Result<(), ChannelError> {
         channel::check(
             views,
             u32::try_from(self.polarity.len()).unwrap_or(u32::MAX),
         )?;
+        if views.len() > self.plan.channels as usize {
+            return Err(self.too_little_for(views.len()));
+        }
         for view in views {
             let stored = &mut self.polarity[view.channel as usize];
             if *stored != view.transfer.polarity {
@@ -241,6 +244,40 @@ impl Renderer {
         self.channels.iter().map(|(view, _)| view)
     }
 
+    /// What would do for so many channels.
+    fn too_little_for(&self, got: usize) -> ChannelError {
+        let channels = u32::try_from(got).unwrap_or(u32::MAX);
+        let ceiling = self.options.memory_bytes;
+        let needed = match planned(&self.gpu, &self.volume, &self.options, channels) {
+            Err(RendererError::Ceiling { needed, .. }) => needed,
+            _ => ceiling.saturating_add(1),
+        };
+        ChannelError::Memory {
+            got,
+            most: self.plan.channels as usize,
+            ceiling,
+            needed,
+        }
+    }
+
+    /// A ceiling that would do for any view of the channels that are seen, from the coarsest of the levels that they are drawn
+    /// from \[bytes\]; `None` where no ceiling would.
+    pub fn enough_memory(&self) -> Option<u64> {
+        let Ok((tables, (needs, _), device)) = needs(&self.gpu, &self.volume, &self.options, 1)
+        else {
+            return None;
+        };
+        let levels = self.channels().map(|view| self.coarsest_of(view));
+        let bytes = Plan::needed_for(&tables, needs, levels, device)?;
+        Some(bytes.saturating_add(self.options.picture_bytes))
+    }
+
+    /// The coarsest level that a channel may be drawn from.
+    fn coarsest_of(&self, view: &ChannelView) -> u32 {
+        let last = u32::try_from(self.volume.levels.len().saturating_sub(1)).unwrap_or(0);
+        (*view.levels.end()).max(*view.levels.start()).min(last)
+    }
+
     fn set_mode(&mut self, mode: Mode) {
         if self.mode != mode {
             self.mode = mode;
@@ -283,7 +320,8 @@ impl Renderer {
             picture_bytes,
             ..self.options
         };
-        planned(&self.gpu, &self.volume, &options)?;
+        let seen = u32::try_from(self.channels.len()).unwrap_or(u32::MAX);
+        planned(&self.gpu, &self.volume, &options, seen.max(1))?;
         // Before others take their place: both together are above the ceiling.
         self.resources.destroy();
         self.picture.texture.destroy();
@@ -458,6 +496,8 @@ impl Renderer {
     fn read_report(&mut self, frame: Frame, words: &[u32]) -> FrameReport {
         let report = RawReport::new(words, self.plan.usage_words());
         let (bricks_used, blocks_used) = self.memory.note_usage(frame, report.usage);
+        let fidelity = report.fidelity();
+        self.memory.note_finest(fidelity.level.unwrap_or(0));
         let mut misses = Vec::new();
         let mut tables_made = 0;
         for entry in report.misses_by_urgency() {
@@ -479,15 +519,19 @@ impl Renderer {
         let share = |used, slots| used as f32 / slots as f32;
         let used = share(bricks_used, memory.brick_slots);
         let used = used.max(share(blocks_used, memory.table_slots));
-        let fidelity = report.fidelity();
         let next = self.memory.next_frame();
         let complete = fidelity.missing == 0;
-        let bias_moves = self.pressure.report(frame, next, complete, used);
+        let coarsest = self.channels().map(|view| self.coarsest_of(view)).max();
+        let is_coarsest = fidelity.level.is_some() && fidelity.level >= coarsest;
+        let bias_moves = self
+            .pressure
+            .report(frame, next, (complete, is_coarsest), used);
         FrameReport {
             frame,
             misses,
             fidelity,
             redraw: bias_moves || tables_made > 0,
+            starved: self.pressure.is_starved(),
             lod_bias: 0.0,
             memory_bias: 0.0,
             octree_is_current: false,
@@ -495,76 +539,4 @@ impl Renderer {
             memory,
         }
     }
-}
-
-/// How a volume fits a device.
-struct Planned {
-    tables: PageTables,
-    octree: Option<Geometry>,
-    octree_slots: u32,
-    plan: Plan,
-}
-
-fn planned(
-    gpu: &Gpu,
-    volume: &Volume,
-    options: &RendererOptions,
-) -> Result<Planned, RendererError> {
-    let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
-    let octree_slots = channels.min(u32::try_from(MOST_CHANNELS).expect("a few"));
-    let shape = options.page_table_shape;
-    let shape = shape.unwrap_or_else(|| PageTableShape::for_volume(&volume.levels, channels));
-    if !(shape.block_edge.is_power_of_two() && (2..=3).contains(&shape.depth)) {
-        return Err(RendererError::PageTableShape { shape });
-    }
-    let tables = PageTables::new(&volume.levels, channels, shape)?;
-    let limits = gpu.device().limits();
-    let buffers = u64::from(limits.max_storage_buffers_per_shader_stage);
-    if buffers < STORAGE_BUFFERS {
-        let what = "storage buffers a shader";
-        return Err(RendererError::Limit {
-            what,
-            offered: buffers,
-            needed: STORAGE_BUFFERS,
-        });
-    }
-    let device = DeviceLimits {
-        texture_edge: limits.max_texture_dimension_3d,
-        rows: limits.max_texture_dimension_2d,
-        buffer: limits
-            .max_buffer_size
-            .min(limits.max_storage_buffer_binding_size),
-    };
-    let ceiling = options.memory_bytes;
-    let picture = options.picture_bytes;
-    let caches = ceiling.saturating_sub(picture);
-    let octree = (options.traversal == Traversal::ResidencyOctree).then(|| {
-        let cell = options.octree_cell;
-        Geometry::new(volume, cell.unwrap_or_else(|| default_cell(volume)))
-    });
-    let octree_size = OctreeSize {
-        blocks: octree.as_ref().map_or(0, Geometry::all_blocks),
-        slots: octree_slots,
-    };
-    let needs = Needs {
-        octree: octree_size,
-        voxel_bytes: u32::try_from(volume.dtype.bytes()).expect("a few bytes"),
-    };
-    let plan = Plan::new(&tables, needs, caches, device).map_err(|misfit| match misfit {
-        Misfit::Ceiling(needed) => RendererError::Ceiling {
-            ceiling,
-            needed: needed.saturating_add(picture),
-        },
-        Misfit::Buffer(needed) => RendererError::Limit {
-            what: "bytes in a storage buffer",
-            offered: device.buffer,
-            needed,
-        },
-    })?;
-    Ok(Planned {
-        tables,
-        octree,
-        octree_slots,
-        plan,
-    })
 }

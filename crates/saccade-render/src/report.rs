@@ -22,6 +22,9 @@ pub struct FrameReport {
     /// Another frame of the same view will be different, even if nothing is delivered until then:
     /// page tables were added, or the level of detail is about to change.
     pub redraw: bool,
+    /// Bricks find no room although all that is wanted is of the coarsest level there is: less detail does not help, more memory
+    /// does ([`Renderer::enough_memory`](crate::Renderer::enough_memory)).
+    pub starved: bool,
     /// Level-of-detail bias in force: the view's plus what memory asked for.
     pub lod_bias: f32,
     /// Part of `lod_bias` that was added because the bricks of the view do not fit the memory.

@@ -50,6 +50,6 @@ mod settle;
 pub use channels::Channel;
 pub use detail::Detail;
 pub use histogram::{Sample, sample};
-pub use session::{Again, Session, SessionError, SessionOptions, Status, TooLarge, Wake};
+pub use session::{Again, Session, SessionError, SessionOptions, Status, TooLarge, TooMuch, Wake};
 #[cfg(not(target_family = "wasm"))]
 pub use settle::SettleError;

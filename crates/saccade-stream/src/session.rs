@@ -27,7 +27,7 @@ use crate::histogram::Sample;
 use crate::policy::{Limits, Pace, Refresh, Retry};
 use crate::pull::{Freshness, Pull};
 use crate::requests::{Event, Requests};
-pub use memory::TooLarge;
+pub use memory::{TooLarge, TooMuch};
 pub use status::{Again, Status};
 
 /// Bricks whose bounds were told, kept in mind; beyond, all are forgotten and told again.
@@ -48,6 +48,8 @@ pub struct SessionOptions {
     pub frames_in_flight: usize,
     /// Called when there is something new.
     pub wake: Wake,
+    /// Channels that are seen at first; `None` leaves it to the volume.
+    pub seen: Option<Vec<u32>>,
 }
 
 impl Default for SessionOptions {
@@ -57,6 +59,7 @@ impl Default for SessionOptions {
             limits: Limits::default(),
             frames_in_flight: 2,
             wake: Arc::new(|| ()),
+            seen: None,
         }
     }
 }
@@ -68,11 +71,13 @@ impl fmt::Debug for SessionOptions {
             limits,
             frames_in_flight,
             wake: _,
+            seen,
         } = self;
         f.debug_struct("SessionOptions")
             .field("gpu_bytes", gpu_bytes)
             .field("limits", limits)
             .field("frames_in_flight", frames_in_flight)
+            .field("seen", seen)
             .finish_non_exhaustive()
     }
 }
@@ -165,7 +170,12 @@ impl Session {
         let requests = Requests::new(source.clone(), options.wake);
         // Asked after listening began: no change is lost between the two.
         let revision = source.revision();
-        let channels = channels::of_volume(&volume);
+        let mut channels = channels::of_volume(&volume);
+        if let Some(seen) = &options.seen {
+            for (index, channel) in (0..).zip(&mut channels) {
+                channel.visible = seen.contains(&index);
+            }
+        }
         let mut session = Self {
             renderer,
             retry: options.limits.retry,

@@ -5,7 +5,7 @@ use std::time::Duration;
 use saccade_render::View;
 use tokio::time::{Instant, timeout_at};
 
-use crate::session::{Again, Session, Status, TooLarge};
+use crate::session::{Again, Session, Status, TooLarge, TooMuch};
 
 /// The picture is not what it should be.
 #[derive(Clone, Debug, thiserror::Error)]
@@ -31,6 +31,14 @@ pub enum SettleError {
         /// How much it takes.
         #[from]
         source: TooLarge,
+    },
+    /// What is in view takes too much memory. The picture shows a part.
+    #[error("{} bricks find no room", status.fidelity.missing)]
+    TooMuch {
+        /// What would do.
+        source: TooMuch,
+        /// As far as it came.
+        status: Box<Status>,
     },
     /// The device is gone.
     #[error("the GPU was lost while drawing")]
@@ -76,6 +84,10 @@ impl Session {
             if status.settled {
                 if status.complete {
                     return Ok(status);
+                }
+                if let Some(source) = self.too_much() {
+                    let status = Box::new(status);
+                    return Err(SettleError::TooMuch { source, status });
                 }
                 return Err(SettleError::Failed {
                     status: Box::new(status),

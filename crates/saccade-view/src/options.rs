@@ -86,6 +86,21 @@ pub enum OptionsError {
         /// One that would do \[MiB\].
         needed: u64,
     },
+    /// There is no room for as many channels.
+    #[error(
+        "{given} MiB of GPU memory are too few for {got} channels of this volume together; allow {needed} or more \
+         (--gpu-memory {needed}, or gpu-memory={needed} in the page's address), or show {most} at most (--channels)"
+    )]
+    ChannelMemory {
+        /// The ceiling \[MiB\].
+        given: u64,
+        /// One that would do \[MiB\].
+        needed: u64,
+        /// How many channels were to be seen.
+        got: usize,
+        /// How many can be.
+        most: usize,
+    },
 }
 
 impl ViewOptions {
@@ -125,10 +140,12 @@ impl ViewOptions {
             limits: self.limits.clone(),
             frames_in_flight,
             wake,
+            seen: self.channels.clone(),
         };
         let session = Session::new(gpu, source, options);
         let mut session = session.map_err(|error| too_little(&error).unwrap_or(error.into()))?;
-        self.show_channels(&mut session)?;
+        { self.show_channels(&mut session) }
+            .map_err(|error| too_many(&error).unwrap_or(error.into()))?;
         Ok(session)
     }
 
@@ -203,6 +220,25 @@ fn too_little(error: &SessionError) -> Option<OptionsError> {
         } => Some(OptionsError::GpuMemory {
             given: ceiling >> 20,
             needed: needed.div_ceil(1 << 20),
+        }),
+        SessionError::Channels { source } => too_many(source),
+        _ => None,
+    }
+}
+
+/// What would do, where memory is too little for channels.
+fn too_many(error: &ChannelError) -> Option<OptionsError> {
+    match *error {
+        ChannelError::Memory {
+            got,
+            most,
+            ceiling,
+            needed,
+        } => Some(OptionsError::ChannelMemory {
+            given: ceiling >> 20,
+            needed: needed.div_ceil(1 << 20),
+            got,
+            most,
         }),
         _ => None,
     }

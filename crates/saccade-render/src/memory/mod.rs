@@ -90,6 +90,10 @@ pub(crate) struct VirtualMemory {
     next: Frame,
     /// The latest frame whose use of slots is known; slots it used stay.
     reported: Frame,
+    /// The finest level that it wanted.
+    finest_wanted: u32,
+    /// Neither a brick nor a block is finer and could go.
+    no_spare: [bool; 2],
 }
 
 impl VirtualMemory {
@@ -105,6 +109,8 @@ impl VirtualMemory {
             evicted: Vec::new(),
             next: 1,
             reported: 0,
+            finest_wanted: 0,
+            no_spare: [false; 2],
             tables,
         }
     }
@@ -169,6 +175,12 @@ impl VirtualMemory {
             }
         }
         (bricks, blocks)
+    }
+
+    /// The finest level that the latest frame wanted. What is finer stands in for something, at best.
+    pub(crate) fn note_finest(&mut self, level: u32) {
+        self.finest_wanted = level;
+        self.no_spare = [false; 2];
     }
 
     /// What an entry that a frame stumbled on stands for. Adds the missing table if it `may`.
@@ -318,10 +330,34 @@ impl VirtualMemory {
 
     fn add_brick(&mut self, brick: Brick) -> Option<u32> {
         if !self.bricks.has_free() {
-            let evicted = self.bricks.oldest_unused(self.reported)?;
+            let unused = self.bricks.oldest_unused(self.reported);
+            let evicted = unused.or_else(|| self.spare_brick(brick.id.level()))?;
             self.evict_brick(evicted);
         }
         self.bricks.insert(brick, self.next)
+    }
+
+    /// A brick that is used, and only stands in for others such as one of this level: else all that is coarser might have no
+    /// room for ever.
+    fn spare_brick(&mut self, level: u32) -> Option<u32> {
+        if self.no_spare[0] {
+            return None;
+        }
+        let finest = self.finest_wanted.min(level);
+        let spare = self.bricks.oldest_spare(|brick| brick.id.level() < finest);
+        self.no_spare[0] = spare.is_none() && finest == self.finest_wanted;
+        spare
+    }
+
+    /// The same of page table blocks.
+    fn spare_block(&mut self, level: u32) -> Option<u32> {
+        if self.no_spare[1] {
+            return None;
+        }
+        let finest = self.finest_wanted.min(level);
+        let spare = self.blocks.oldest_spare(|block| block.level < finest);
+        self.no_spare[1] = spare.is_none() && finest == self.finest_wanted;
+        spare
     }
 
     fn evict_brick(&mut self, slot: u32) {
@@ -339,7 +375,8 @@ impl VirtualMemory {
     /// Puts a block of unknown entries, or of empty ones where that was known, under an entry.
     fn add_block(&mut self, parent: u32, id: BrickId, step: u32) -> Option<u32> {
         if !self.blocks.has_free() {
-            let evicted = self.blocks.oldest_unused(self.reported)?;
+            let unused = self.blocks.oldest_unused(self.reported);
+            let evicted = unused.or_else(|| self.spare_block(id.level()))?;
             self.evict_block(evicted);
         }
         let shape = self.tables.shape();

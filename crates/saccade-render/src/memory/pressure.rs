@@ -13,6 +13,8 @@ const PATIENCE: u32 = 4;
 /// Frames for which what did not fit one view counts in those that follow it: while the camera moves, a level that does
 /// not fit is tried, and its bricks are loaded, once in so many frames.
 const REMEMBERED: u32 = 40;
+/// Frames in a row in which bricks of the coarsest level found no room, before that is taken for what it will stay.
+const STARVES: u32 = 3;
 
 /// The level-of-detail bias that memory asks for.
 ///
@@ -31,6 +33,8 @@ pub(crate) struct Pressure {
     /// Frames after which that is forgotten, once the view is another.
     forgotten_in: Option<u32>,
     complete: u32,
+    /// Frames in a row in which nothing coarser could help.
+    starved: u32,
 }
 
 impl Pressure {
@@ -52,15 +56,32 @@ impl Pressure {
         }
     }
 
-    /// A frame is known: whether it was complete, and which share of the slots it used.
+    /// Whether bricks find no room, and coarser ones do not exist.
+    pub(crate) fn is_starved(&self) -> bool {
+        self.starved >= STARVES
+    }
+
+    /// A frame is known: whether it was complete, and all that it wanted of the coarsest level, and which share of the
+    /// slots it used.
     ///
     /// Returns whether the bias moved or is about to, so that another frame is worth drawing.
-    pub(crate) fn report(&mut self, frame: Frame, next: Frame, complete: bool, used: f32) -> bool {
+    pub(crate) fn report(
+        &mut self,
+        frame: Frame,
+        next: Frame,
+        (complete, coarsest): (bool, bool),
+        used: f32,
+    ) -> bool {
         let refused = std::mem::take(&mut self.refused);
         if frame < self.since {
             return false;
         }
         self.complete = if complete { self.complete + 1 } else { 0 };
+        if refused && !complete && coarsest {
+            self.starved = self.starved.saturating_add(1);
+            return !self.is_starved();
+        }
+        self.starved = 0;
         if refused && !complete {
             (self.too_fine, self.forgotten_in) = (Some(self.bias), None);
             self.change(self.bias + STEP, next);
@@ -111,7 +132,7 @@ mod tests {
             if used > 1.0 {
                 pressure.refuse();
             }
-            pressure.report(frame, frame + 1, used <= 1.0, used.min(1.0));
+            pressure.report(frame, frame + 1, (used <= 1.0, false), used.min(1.0));
             pressure.bias()
         });
         biases.collect()
@@ -165,13 +186,33 @@ mod tests {
     }
 
     #[test]
+    fn who_is_starved_at_the_coarsest_level_is_told_so_until_there_is_room() {
+        let mut pressure = Pressure::default();
+        let mut frame = 0;
+        let mut report = |pressure: &mut Pressure, refused, complete| {
+            frame += 1;
+            if refused {
+                pressure.refuse();
+            }
+            pressure.report(frame, frame + 1, (complete, true), 1.0)
+        };
+        assert!(report(&mut pressure, true, false) && !pressure.is_starved());
+        assert!(report(&mut pressure, true, false) && !pressure.is_starved());
+        let again = report(&mut pressure, true, false);
+        assert!(pressure.is_starved() && !again, "drawn for nothing");
+        assert_eq!(pressure.bias(), 0.0, "nothing is coarser");
+        report(&mut pressure, false, true);
+        assert!(!pressure.is_starved());
+    }
+
+    #[test]
     fn frames_from_before_a_change_are_not_counted_again() {
         let mut pressure = Pressure::default();
         pressure.refuse();
-        pressure.report(5, 9, false, 1.0);
+        pressure.report(5, 9, (false, false), 1.0);
         for frame in 6..9 {
             pressure.refuse();
-            pressure.report(frame, 9, false, 1.0);
+            pressure.report(frame, 9, (false, false), 1.0);
         }
         assert_eq!(
             pressure.bias(),

@@ -116,6 +116,15 @@ impl<T> Slots<T> {
         None
     }
 
+    /// Of the slots whose owner is `spare`, the one used longest ago.
+    pub(crate) fn oldest_spare(&self, spare: impl Fn(&T) -> bool) -> Option<u32> {
+        let mut slot = self.oldest;
+        while slot != NONE && !self.owner(slot).is_some_and(&spare) {
+            slot = self.links[slot as usize].newer;
+        }
+        (slot != NONE).then_some(slot)
+    }
+
     #[cfg(test)]
     pub(crate) fn last_used(&self, slot: u32) -> Frame {
         self.links[slot as usize].last_used

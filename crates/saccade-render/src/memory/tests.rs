@@ -413,3 +413,37 @@ fn regions_known_to_be_empty_take_no_table() {
         assert_eq!(known(&world.memory), 0);
     }
 }
+
+/// Where all is in use, what is coarser than all that it shows comes in its place, and nothing else.
+#[test]
+fn what_only_stands_in_makes_room_for_what_is_coarser() {
+    let fine = |x| BrickId::new(0, 0, UVec3::new(x, 0, 0)).unwrap();
+    let coarse = |channel| BrickId::new(channel, 2, UVec3::ZERO).unwrap();
+    // Too few bricks, and too few blocks.
+    for (blocks, bricks) in [(8, 3), (1, 8)] {
+        let World { mut memory, .. } = World::new(2, blocks, bricks);
+        for x in 0..3 {
+            assert!(matches!(memory.place(fine(x)), Placement::Slot(_)));
+        }
+        memory.frame_submitted();
+        let use_all = |memory: &mut VirtualMemory, finest| {
+            memory.frame_submitted();
+            memory.note_usage(memory.next_frame() - 1, &[u32::MAX]);
+            memory.note_finest(finest);
+        };
+        use_all(&mut memory, 0);
+        assert_eq!(memory.place(coarse(0)), Placement::NoRoom, "all is wanted");
+        use_all(&mut memory, 1);
+        assert!(matches!(memory.place(coarse(0)), Placement::Slot(_)));
+        let gone: Vec<BrickId> = memory.take_evicted().collect();
+        assert_eq!(gone.len(), if blocks == 1 { 3 } else { 1 });
+        assert_eq!(gone[0], fine(0), "the one used longest ago");
+        assert_eq!(memory.resolve(gone[0]), Entry::UNMAPPED);
+        use_all(&mut memory, 2);
+        if blocks > 1 {
+            assert_eq!(memory.place(fine(9)), Placement::NoRoom, "as fine as they");
+        }
+        use_all(&mut memory, 0);
+        assert_eq!(memory.place(coarse(1)), Placement::NoRoom);
+    }
+}

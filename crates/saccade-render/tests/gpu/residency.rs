@@ -9,7 +9,8 @@ use saccade_core::transfer::{ColorMap, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
-    BrickVoxels, Delivery, FalseColors, FrameReport, Renderer, RendererOptions, View,
+    BrickVoxels, ChannelError, ChannelView, Delivery, FalseColors, FrameReport, Gpu, Renderer,
+    RendererError, RendererOptions, View,
 };
 
 use crate::behaviour::{SIZE, close_up, renderer};
@@ -280,4 +281,113 @@ fn reasons_to_draw_lead_to_a_complete_picture() {
             );
         }
     }
+}
+
+/// Draws and delivers until the picture is complete or nothing changes any more.
+fn run(renderer: &mut Renderer, view: &View) -> FrameReport {
+    let voxels: Vec<u8> = (0..BRICK_STORED_VOXELS)
+        .map(|i| 100 + (i % 90) as u8)
+        .collect();
+    for _ in 0..100 {
+        let report = frame(renderer, view);
+        assert!(report.memory.total() <= report.memory.ceiling);
+        if report.is_complete() || report.starved {
+            return report;
+        }
+        for &id in &report.misses {
+            renderer.deliver(id, BrickVoxels::Voxels(&voxels)).unwrap();
+        }
+    }
+    panic!("neither complete nor starved after 100 frames");
+}
+
+fn within(gpu: &Gpu, volume: &Arc<Volume>, memory_bytes: u64) -> Result<Renderer, RendererError> {
+    let picture_bytes = u64::from(SIZE.element_product()) * 4;
+    let options = RendererOptions {
+        memory_bytes,
+        picture_bytes,
+        ..RendererOptions::default()
+    };
+    Renderer::new(gpu, volume.clone(), options)
+}
+
+/// So that all of a volume is seen.
+fn see_through(channels: u32) -> Vec<ChannelView> {
+    let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 0.01)], 1e5);
+    let view = |channel| ChannelView::new(channel, transfer.clone());
+    (0..channels).map(view).collect()
+}
+
+/// The least ceiling that is named suffices for as many channels as are seen, wherever they are seen from.
+#[test]
+fn the_least_memory_counts_the_channels_that_are_seen() {
+    let Some(gpu) = gpu() else { return };
+    for extent in [[330, 290, 150], [1000, 990, 970], [1330, 1290, 1150]] {
+        let volume = Volume::new("v", extent.into(), DVec3::splat(4.0)).unwrap();
+        let volume = Arc::new(Volume {
+            channels: (0..16).map(|n| format!("channel {n}")).collect(),
+            ..volume
+        });
+        let Err(RendererError::Ceiling { needed, .. }) = within(&gpu, &volume, 1) else {
+            panic!("a byte is too little");
+        };
+        let mut ceiling = needed;
+        for seen in [1, 5, 16] {
+            let mut renderer = within(&gpu, &volume, ceiling).unwrap();
+            match renderer.set_channels(&see_through(seen)) {
+                Ok(()) => {}
+                Err(ChannelError::Memory {
+                    got, most, needed, ..
+                }) => {
+                    assert!(most < seen as usize && got == seen as usize && needed > ceiling);
+                    // What is seen stays.
+                    assert_eq!(renderer.channels().len(), 0);
+                    renderer.set_channels(&see_through(most as u32)).unwrap();
+                    ceiling = needed;
+                    renderer = within(&gpu, &volume, ceiling).unwrap();
+                    renderer.set_channels(&see_through(seen)).unwrap();
+                }
+                Err(error) => panic!("{error}"),
+            }
+            for lod_bias in [-2.5, -1.0, 0.0, 9.0] {
+                let view = View {
+                    lod_bias,
+                    ..View::new(Camera::around(&volume), SIZE)
+                };
+                let report = run(&mut renderer, &view);
+                assert!(
+                    report.is_complete(),
+                    "{seen} channels of {extent:?}, {lod_bias}: {report:?}"
+                );
+            }
+        }
+        assert!(ceiling > needed, "16 channels need more than one");
+        assert!(ceiling < 8 << 20, "{ceiling}");
+    }
+}
+
+/// Where there is no coarser level, what would do is told, and does.
+#[test]
+fn what_does_not_fit_at_any_level_is_told() {
+    let Some(gpu) = gpu() else { return };
+    let volume = Volume::new("v", UVec3::new(330, 290, 150), DVec3::splat(4.0)).unwrap();
+    let volume = Arc::new(Volume {
+        levels: volume.levels[..1].to_vec(),
+        ..volume
+    });
+    let view = View::new(Camera::around(&volume), SIZE);
+    let mut renderer = within(&gpu, &volume, 5 << 20).unwrap();
+    renderer.set_channels(&see_through(1)).unwrap();
+    let report = run(&mut renderer, &view);
+    assert!(report.starved && !report.is_complete() && !report.redraw);
+    let near = View {
+        camera: view.camera.zoomed(30.0),
+        ..view
+    };
+    assert!(run(&mut renderer, &near).is_complete(), "a part of it fits");
+    let enough = renderer.enough_memory().unwrap();
+    assert!(enough > 20 << 20, "550 bricks do not fit {enough} bytes");
+    let mut renderer = within(&gpu, &volume, enough).unwrap();
+    renderer.set_channels(&see_through(1)).unwrap();
+    assert!(run(&mut renderer, &view).is_complete());
 }

@@ -34,6 +34,12 @@ impl Session {
         let Some(report) = &self.report else {
             return;
         };
+        if report.starved {
+            // It would find no room.
+            let frame = report.frame;
+            self.pull.want(frame, &[]);
+            return;
+        }
         let (frame, misses) = (report.frame, report.misses.clone());
         // What a frame does not know yet it misses.
         let knows = report.octree_is_current.then_some(frame);

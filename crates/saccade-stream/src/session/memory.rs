@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::UVec2;
 use saccade_core::volume::Volume;
 use saccade_render::wgpu::DeviceType;
-use saccade_render::{Gpu, Renderer, RendererError, RendererOptions};
+use saccade_render::{ChannelError, Gpu, Renderer, RendererError, RendererOptions};
 
 use super::{Session, SessionError};
 
@@ -25,6 +25,23 @@ pub struct TooLarge {
     pub ceiling: u64,
     /// One that would do \[bytes\].
     pub needed: u64,
+}
+
+/// Bricks of a view that do not fit below the ceiling, not even those of the coarsest level.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{ceiling} bytes of GPU memory are too few for what is in view, even at the coarsest level that is drawn; {}", way_out(*needed))]
+pub struct TooMuch {
+    /// The ceiling in force \[bytes\].
+    pub ceiling: u64,
+    /// One that would do for any view, if there is any \[bytes\].
+    pub needed: Option<u64>,
+}
+
+fn way_out(needed: Option<u64>) -> String {
+    match needed {
+        Some(needed) => format!("allow {needed}, go nearer, or show fewer channels"),
+        None => "go nearer, or show fewer channels".to_owned(),
+    }
 }
 
 /// What is kept while no picture's size is known \[bytes\].
@@ -66,6 +83,24 @@ pub(super) fn renderer(
     })
 }
 
+/// What would do for channels, where at least the share is kept for the picture.
+pub(super) fn with_share_of(error: ChannelError, kept_bytes: u64) -> ChannelError {
+    match error {
+        ChannelError::Memory {
+            got,
+            most,
+            ceiling,
+            needed,
+        } => ChannelError::Memory {
+            got,
+            most,
+            ceiling,
+            needed: with_share(needed, kept_bytes),
+        },
+        other => other,
+    }
+}
+
 impl Session {
     /// Sees to it that a picture of this size fits below the ceiling. One that does not is not drawn.
     pub(super) fn make_room(&mut self, size: UVec2) {
@@ -99,6 +134,17 @@ impl Session {
                 needed,
             });
         }
+    }
+
+    /// Why the newest view stays incomplete, if too much is in it for the memory.
+    pub fn too_much(&self) -> Option<TooMuch> {
+        let known = self.pending.is_empty() && !self.dirty;
+        let starved = self.report.as_ref().is_some_and(|report| report.starved);
+        (known && starved).then(|| TooMuch {
+            ceiling: self.gpu_bytes,
+            needed: { self.renderer.enough_memory() }
+                .map(|needed| with_share(needed, self.kept_bytes)),
+        })
     }
 
     /// Why nothing of the newest view is drawn, if it is too large a picture.

@@ -4,6 +4,7 @@ use saccade_core::transfer::TransferFunction;
 use saccade_render::ChannelError;
 
 use super::Session;
+use super::memory::with_share_of;
 use crate::channels::{self, Channel};
 use crate::detail::Detail;
 
@@ -17,7 +18,8 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// [`ChannelError`] for a channel that the volume does not have, and when too many would be seen.
+    /// [`ChannelError`] for a channel that the volume does not have, and when too many would be seen, or more than there is
+    /// GPU memory for.
     pub fn set_visible(&mut self, channel: u32, visible: bool) -> Result<(), ChannelError> {
         let before = self.channel_mut(channel)?.visible;
         self.channel_mut(channel)?.visible = visible;
@@ -108,7 +110,9 @@ impl Session {
     pub(super) fn put_channels(&mut self) -> Result<(), ChannelError> {
         let views = channels::views(&self.channels);
         if self.views != views {
-            self.renderer.set_channels(&views)?;
+            let kept_bytes = self.kept_bytes;
+            let set = self.renderer.set_channels(&views);
+            set.map_err(|error| with_share_of(error, kept_bytes))?;
             self.views = views;
             // What was hidden may be seen, and the renderer may have forgotten what it knew.
             self.told.clear();

@@ -78,6 +78,9 @@ impl Session {
         if let Some(too_large) = self.too_large {
             progress.failure = Some(too_large.to_string());
         }
+        if let Some(too_much) = self.too_much() {
+            progress.failure = Some(too_much.to_string());
+        }
         let report = self.report.as_ref();
         let known = self.pending.is_empty() && !self.dirty;
         let searching = self.requests.is_sampling() || self.requests.is_finding();

@@ -10,12 +10,12 @@ use saccade_core::space::Point;
 use saccade_core::transfer::{ColorMap, OpacityPoint, TransferFunction};
 use saccade_core::volume::{Polarity, Volume};
 use saccade_core::voxel_box::VoxelBox;
-use saccade_render::{Image, View};
+use saccade_render::{ChannelError, Image, RendererError, View};
 use saccade_source::maybe_send::{BoxFuture, BoxStream};
 use saccade_source::memory::ArraySource;
 use saccade_source::{Change, Chunk, ChunkError, ChunkId, VolumeSource};
 use saccade_stream::policy::Limits;
-use saccade_stream::{Again, Session, SessionOptions, SettleError};
+use saccade_stream::{Again, Session, SessionError, SessionOptions, SettleError};
 
 use crate::{PATIENCE, options, picture, source, test_gpu, value, view};
 
@@ -115,6 +115,129 @@ async fn a_large_picture_fits_the_ceiling_or_is_refused() {
     let again = lit(&picture(&mut session, &small).await);
     assert!(again.abs_diff(first) < first / 20, "{again} and {first}");
     assert_eq!(session.frame(&small).progress.failure, None);
+}
+
+/// Sixteen channels of a volume that is seen through.
+struct Channels(Arc<Volume>);
+
+impl VolumeSource for Channels {
+    fn volume(&self) -> &Arc<Volume> {
+        &self.0
+    }
+
+    fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        let voxels = self.0.chunk.as_usizevec3().element_product();
+        let of = u8::try_from(60 + id.channel).unwrap();
+        let voxels = (0..voxels).map(|n| of + u8::try_from(n % 97).unwrap());
+        let voxels: Vec<u8> = voxels.collect();
+        Box::pin(async move { Ok(Chunk::Voxels(voxels.into())) })
+    }
+
+    fn changes(&self) -> BoxStream<'static, Change> {
+        Box::pin(futures::stream::pending())
+    }
+}
+
+/// The least memory depends on how many channels are seen, and the figure that is named is enough.
+#[tokio::test(flavor = "multi_thread")]
+async fn channels_that_do_not_fit_are_refused_and_what_would_do_does() {
+    let Some(gpu) = test_gpu().await else { return };
+    let extent = UVec3::new(1_000, 900, 300);
+    let volume = Volume::new("many", extent, DVec3::new(4.0, 4.0, 8.0)).unwrap();
+    let source = Arc::new(Channels(Arc::new(Volume {
+        channels: (0..16).map(|n| format!("stain {n}")).collect(),
+        ..volume
+    })));
+    let of = |gpu_bytes, seen: u32| SessionOptions {
+        gpu_bytes,
+        seen: Some((0..seen).collect()),
+        ..options()
+    };
+    let refused = Session::new(&gpu, source.clone(), of(1 << 20, 1)).err();
+    let Some(SessionError::Renderer {
+        source: RendererError::Ceiling { needed: one, .. },
+        ..
+    }) = refused
+    else {
+        panic!("{refused:?}")
+    };
+    let refused = Session::new(&gpu, source.clone(), of(one, 16)).err();
+    let Some(SessionError::Channels {
+        source: ChannelError::Memory {
+            got, most, needed, ..
+        },
+    }) = refused
+    else {
+        panic!("{refused:?}")
+    };
+    assert!(got == 16 && (1..16).contains(&most) && needed > one);
+    for (bytes, seen) in [(one, most as u32), (needed, 16)] {
+        let mut session = Session::new(&gpu, source.clone(), of(bytes, seen)).unwrap();
+        let view = View {
+            lod_bias: -2.0,
+            ..view(source.as_ref())
+        };
+        let status = session.settle(&view, PATIENCE).await.unwrap();
+        assert!(status.complete && status.memory.total() <= bytes);
+        assert!(status.memory_bias > 0.0, "all fits anyway");
+        // One more is refused, and those that are seen stay.
+        if let Err(error) = session.set_visible(seen, true) {
+            let is = session.channels().iter().filter(|c| c.visible).count();
+            assert_eq!(is, seen as usize, "{error}");
+        } else {
+            assert!(seen < 16, "there is no seventeenth");
+            panic!("{} channels fit", seen + 1);
+        }
+    }
+}
+
+/// An image without coarser levels.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_no_level_makes_fit_ends_the_wait_and_says_what_would() {
+    let Some(gpu) = test_gpu().await else { return };
+    let extent = UVec3::new(330, 290, 150);
+    let volume = Volume::new("flat", extent, DVec3::new(4.0, 4.0, 8.0)).unwrap();
+    let source = Arc::new(Channels(Arc::new(Volume {
+        levels: volume.levels[..1].to_vec(),
+        ..volume
+    })));
+    let of = |gpu_bytes| SessionOptions {
+        gpu_bytes,
+        ..options()
+    };
+    let see_through = TransferFunction {
+        polarity: Polarity::Bright,
+        color_map: ColorMap::Gray,
+        window: [0.0, 1.0],
+        opacity: vec![OpacityPoint {
+            value: 0.0,
+            opacity: 0.001,
+        }],
+        opacity_length_nm: 1e5,
+    };
+    let all = view(source.as_ref());
+    let mut session = Session::new(&gpu, source.clone(), of(6 << 20)).unwrap();
+    session
+        .set_transfer_function(0, see_through.clone())
+        .unwrap();
+    let refused = session.settle(&all, PATIENCE).await.unwrap_err();
+    let SettleError::TooMuch { source: why, .. } = refused else {
+        panic!("{refused:?}")
+    };
+    let status = session.frame(&all);
+    assert!(status.settled && !status.complete && !status.drew);
+    assert_eq!(status.again, Again::WhenWoken, "nothing is tried for ever");
+    assert_eq!(status.progress.failure, Some(why.to_string()));
+    let near = View {
+        camera: all.camera.zoomed(40.0),
+        ..all
+    };
+    let status = session.settle(&near, PATIENCE).await.unwrap();
+    assert!(status.complete && status.progress.failure.is_none());
+    let needed = why.needed.unwrap();
+    let mut session = Session::new(&gpu, source, of(needed)).unwrap();
+    session.set_transfer_function(0, see_through).unwrap();
+    assert!(session.settle(&all, PATIENCE).await.unwrap().complete);
 }
 
 #[tokio::test(flavor = "multi_thread")]

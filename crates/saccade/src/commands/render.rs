@@ -74,6 +74,20 @@ impl Render {
             {
                 *status
             }
+            Err(SettleError::TooMuch { status, .. }) if self.partial => *status,
+            Err(SettleError::TooMuch { source, status }) => {
+                let size = source.needed.map(|needed| needed.div_ceil(1 << 20));
+                let more = size.map_or_else(String::new, |mib| {
+                    format!("give {mib} or more with --gpu-memory, ")
+                });
+                bail!(
+                    "{} bricks of what is in view find no room in {} MiB of GPU memory, though drawn from the coarsest \
+                     level: {more}show fewer channels with --channels, or less of the volume with --clip or from nearer \
+                     (--camera); --partial takes the picture without them",
+                    status.fidelity.missing,
+                    source.ceiling >> 20
+                )
+            }
             Err(SettleError::Timeout { .. }) if self.timeout.is_zero() => bail!(
                 "one frame did not complete the picture, and it was not written; --timeout waits \
                  longer, --partial takes it as it is"
