@@ -17,8 +17,8 @@ pub enum Detail {
     /// One voxel a pixel, as the view asks for.
     #[default]
     Full,
-    /// No level that differs from the next coarser one by less than a hundredth of the values' variance: found
-    /// from the bricks that arrive.
+    /// No level that differs from the next coarser one by less than a hundredth of the values' variance, or not at
+    /// all: found from the bricks that arrive.
     ByContent,
     /// As somebody chose.
     Chosen {
@@ -33,6 +33,8 @@ pub enum Detail {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Content {
     levels: Vec<Spread>,
+    /// Smallest and largest of all values that were looked at, 0 for what was not acquired.
+    range: Option<[u16; 2]>,
     /// Finest voxels that have changed since these bricks were looked at, and before.
     changed: [u64; 2],
 }
@@ -42,6 +44,7 @@ impl Default for Content {
         let few = u64::from(JUDGED_BRICKS) * u64::from(BRICK_EDGE).pow(3);
         Self {
             levels: Vec::new(),
+            range: None,
             changed: [0, few],
         }
     }
@@ -73,12 +76,28 @@ impl Content {
             *before = before.saturating_add(*since);
             *since = 0;
             self.levels.clear();
+            self.range = None;
         }
     }
 
     /// Takes a brick's values, stored with its border, little-endian, into account.
     pub(crate) fn note(&mut self, volume: &Volume, level: u32, voxels: &[u8]) {
         let (at, next) = (level as usize, level as usize + 1);
+        if at >= volume.levels.len() {
+            return;
+        }
+        let values: Vec<u16> = match volume.dtype {
+            Dtype::Uint16 => {
+                let (pairs, _) = voxels.as_chunks::<2>();
+                pairs.iter().copied().map(u16::from_le_bytes).collect()
+            }
+            _ => voxels.iter().copied().map(u16::from).collect(),
+        };
+        // Of the coarsest level, too: its few bricks show what those that were looked at elsewhere leave out.
+        self.range = values.iter().fold(self.range, |range, &value| {
+            let [least, most] = range.unwrap_or([value; 2]);
+            Some([least.min(value), most.max(value)])
+        });
         let Some([here, coarser]) = volume.levels.get(at..=next) else {
             return;
         };
@@ -88,13 +107,6 @@ impl Content {
         let spread = &mut self.levels[at];
         spread.bricks += 1;
         let edge = block_edge(coarser.downsampling / here.downsampling);
-        let values: Vec<u16> = match volume.dtype {
-            Dtype::Uint16 => {
-                let (pairs, _) = voxels.as_chunks::<2>();
-                pairs.iter().copied().map(u16::from_le_bytes).collect()
-            }
-            _ => voxels.iter().copied().map(u16::from).collect(),
-        };
         if values.len() == BRICK_STORED_VOXELS {
             spread.add(&values, edge);
         }
@@ -102,9 +114,14 @@ impl Content {
 
     /// The finest level that has to be drawn, as far as is known.
     pub(crate) fn finest_needed(&self) -> u32 {
-        let needed = |s: &Spread| s.bricks >= JUDGED_BRICKS && s.lost > MOST_LOST * s.all;
+        // One value everywhere is the same at all levels. Bricks of one value each tell nothing: others may have more.
+        let alike = self
+            .range
+            .is_some_and(|[least, most]| least == most && least > 0);
+        let judged = |s: &Spread| s.bricks >= JUDGED_BRICKS;
+        let needed = |s: &Spread| judged(s) && s.lost > MOST_LOST * s.all;
         let not_needed =
-            |s: &Spread| s.bricks >= JUDGED_BRICKS && s.all > 0.0 && s.lost <= MOST_LOST * s.all;
+            |s: &Spread| judged(s) && (s.all > 0.0 || alike) && s.lost <= MOST_LOST * s.all;
         let first = self.levels.iter().position(needed);
         let below = &self.levels[..first.unwrap_or(self.levels.len())];
         let last = below.iter().rposition(not_needed);
@@ -154,7 +171,9 @@ impl Spread {
             }
         }
         if blocks > 0.0 {
-            self.all += squares - sum * sum / (blocks * count);
+            // Whole numbers differ by none or by one at least; less is rounding.
+            let all = squares - sum * sum / (blocks * count);
+            self.all += if all < 0.25 { 0.0 } else { all };
         }
     }
 }
@@ -244,6 +263,39 @@ mod tests {
     }
 
     #[test]
+    fn where_all_is_alike_the_next_coarser_level_shows_the_same() {
+        for dtype in [Dtype::Uint8, Dtype::Uint16] {
+            let volume = volume(dtype);
+            let coarsest = u32::try_from(volume.levels.len() - 1).unwrap();
+            let of = |value: f64| brick(dtype, move |_| value);
+            let alike = |levels: u32| {
+                let mut content = Content::default();
+                for level in 0..levels {
+                    for _ in 0..JUDGED_BRICKS {
+                        content.note(&volume, level, &of(251.0));
+                    }
+                }
+                content.note(&volume, coarsest, &of(251.0));
+                content
+            };
+            assert_eq!(alike(0).finest_needed(), 0, "nothing fine was seen");
+            assert_eq!(alike(1).finest_needed(), 1);
+            assert_eq!(alike(3).finest_needed(), 3);
+            // The same bricks, in a volume that has something else somewhere.
+            let other = brick(dtype, |at| if at.x == 30 { 250.0 } else { 251.0 });
+            for seen in [other, of(250.0), of(0.0)] {
+                let mut content = alike(1);
+                content.note(&volume, coarsest, &seen);
+                assert_eq!(content.finest_needed(), 0);
+            }
+            let mut content = alike(1);
+            content.change(u64::MAX, u64::MAX);
+            content.note(&volume, 0, &of(9.0));
+            assert_eq!((content.finest_needed(), content.range), (0, Some([9; 2])));
+        }
+    }
+
+    #[test]
     fn what_is_lost_is_what_block_means_do_not_say() {
         // Alternating 10 and 30 along x: blocks of two lose all of it, of one nothing.
         let values: Vec<u16> = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE))
@@ -273,7 +325,11 @@ mod tests {
             content.note(&volume, 0, &half);
         }
         assert_eq!(content.levels[0].lost, 0.0);
-        assert_eq!(content.finest_needed(), 0, "no variance says nothing");
+        assert_eq!(
+            content.finest_needed(),
+            0,
+            "where it ends, coarser levels differ"
+        );
         let coarsest = u32::try_from(volume.levels.len() - 1).unwrap();
         content.note(&volume, coarsest, &half);
         content.note(&volume, coarsest + 7, &half);
