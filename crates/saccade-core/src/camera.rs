@@ -28,6 +28,9 @@ pub struct Camera {
     pub fov: f64,
 }
 
+/// So many pixels wide, a volume meets the middle of some.
+const WIDE_ENOUGH: f64 = 2.0;
+
 /// Text that names no camera.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("camera {text:?} is not yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres")]
@@ -62,6 +65,45 @@ impl Camera {
             pitch: 25.0,
             fov: Self::FOV,
         }
+    }
+
+    /// From nearer by where a thin volume would be less than two pixels wide in a picture \[pixels\], which may meet none of them;
+    /// no nearer than all of its corners allow. What is turned then may leave the picture.
+    pub fn near_enough(self, volume: &Volume, image: DVec2) -> Self {
+        let (size, image) = (volume.size_nm(), image.max(DVec2::ONE));
+        let pixels = self.narrowest_nm(size) / self.pixel_nm(self.distance_nm, image.y);
+        if pixels >= WIDE_ENOUGH {
+            return self;
+        }
+        let tangent = (self.fov / 2.0).to_radians().tan();
+        let whole = 1.02 * self.distance_of(size, DVec2::new(image.x / image.y, 1.0) * tangent);
+        let near = self.distance_nm * pixels / WIDE_ENOUGH;
+        Self {
+            distance_nm: near.max(whole).min(self.distance_nm),
+            ..self
+        }
+    }
+
+    /// The width of a box's outline where it is narrowest \[nm\].
+    fn narrowest_nm(&self, size: DVec3) -> f64 {
+        let axes = self.physical_from_eye_axes();
+        let widths = (0..90_u32).map(|step| {
+            let (sin, cos) = (f64::from(step) * 2.0).to_radians().sin_cos();
+            let across = axes.x_axis * cos + axes.y_axis * sin;
+            across.abs().dot(size)
+        });
+        widths.fold(f64::INFINITY, f64::min)
+    }
+
+    /// From how far away a box around the target is whole in a picture with these tangents of half its opening angles.
+    fn distance_of(&self, size: DVec3, tangents: DVec2) -> f64 {
+        let eye_from_physical = self.physical_from_eye_axes().transpose();
+        let corners = (0..8_u8).map(|corner| {
+            let signs = [1, 2, 4].map(|bit| if corner & bit == 0 { -0.5 } else { 0.5 });
+            eye_from_physical * (DVec3::from_array(signs) * size)
+        });
+        let needed = corners.map(|at| (at.truncate().abs() / tangents).max_element() - at.z);
+        needed.fold(0.0, f64::max)
     }
 
     /// Right, down and forward: unit vectors in physical space, as columns.
@@ -219,6 +261,46 @@ mod tests {
                 .distance_nm
                 .is_finite()
         );
+    }
+
+    #[test]
+    fn thin_volumes_are_seen_in_narrow_pictures() {
+        let nm = DVec3::new(16.0, 16.0, 40.0);
+        for extent in [[20, 600, 6], [600, 20, 6], [20, 20, 600]] {
+            let volume = Volume::new("v", UVec3::from_array(extent), nm).unwrap();
+            for image in [[8.0, 600.0], [600.0, 8.0], [9.0, 601.0]] {
+                let image = DVec2::from(image);
+                let framed = Camera::framing(&volume, image);
+                let camera = framed.near_enough(&volume, image);
+                assert!(camera.distance_nm <= framed.distance_nm);
+                let corners = (0..8).map(|corner| {
+                    let corner = [1, 2, 4].map(|bit| f64::from(corner & bit).min(1.0));
+                    let at = volume.size_nm() * DVec3::from_array(corner) - camera.eye().xyz;
+                    let at = camera.physical_from_eye_axes().transpose() * at;
+                    assert!(at.z > 0.0);
+                    let tangent = (camera.fov / 2.0).to_radians().tan();
+                    at.truncate() / at.z / tangent * image.y / 2.0
+                });
+                let corners: Vec<DVec2> = corners.collect();
+                let all = |at: &DVec2| at.abs().cmple(image / 2.0).all();
+                assert!(
+                    corners.iter().all(all),
+                    "{extent:?} in {image}: {corners:?}"
+                );
+            }
+        }
+        let volume = Volume::new("v", UVec3::new(20, 600, 6), nm).unwrap();
+        let image = DVec2::new(8.0, 600.0);
+        let framed = Camera::framing(&volume, image);
+        let width = |camera: Camera| {
+            camera.narrowest_nm(volume.size_nm()) / camera.pixel_nm(camera.distance_nm, image.y)
+        };
+        assert!(width(framed) < 0.5, "{} pixels", width(framed));
+        assert!(width(framed.near_enough(&volume, image)) > 1.5);
+        // What is wide enough stays where it is.
+        let image = DVec2::new(7.0, 400.0);
+        let framed = Camera::framing(&self::volume(), image);
+        assert_eq!(framed.near_enough(&self::volume(), image), framed);
     }
 
     #[test]

@@ -227,7 +227,8 @@ impl App {
         );
         let input = input_on(ui, &response);
         let height = f64::from(place.rect.height());
-        let home = Camera::framing(self.session.volume(), place.size.as_dvec2());
+        let (volume, image) = (self.session.volume(), place.size.as_dvec2());
+        let home = Camera::framing(volume, image).near_enough(volume, image);
         if self.camera == self.home {
             // As the window is made narrower, nothing is cut off.
             self.camera = home;

@@ -151,7 +151,8 @@ impl ViewOptions {
 
     /// One picture of a volume.
     pub fn view(&self, volume: &Volume, size: UVec2) -> View {
-        let framing = || Camera::framing(volume, size.as_dvec2());
+        let image = size.as_dvec2();
+        let framing = || Camera::framing(volume, image).near_enough(volume, image);
         let camera = self.camera.unwrap_or_else(framing);
         View {
             background: self.background,
