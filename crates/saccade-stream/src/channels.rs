@@ -91,10 +91,11 @@ impl Channel {
 pub(crate) fn of_volume(volume: &Volume) -> Vec<Channel> {
     let seen = shown_at_first(volume);
     let channel = |(index, name): (usize, &String)| {
+        let number = u32::try_from(index).unwrap_or(u32::MAX);
         let histogram = Histogram::new(volume.dtype);
         let mut channel = Channel {
             name: name.clone(),
-            visible: seen.contains(&index),
+            visible: seen.contains(&number),
             transfer: histogram.transfer_function(volume.size_nm()),
             histogram,
             automatic: true,
@@ -109,7 +110,7 @@ pub(crate) fn of_volume(volume: &Volume) -> Vec<Channel> {
 }
 
 /// Channels that are shown at first: those that the volume does not hide, or the first few of them.
-fn shown_at_first(volume: &Volume) -> Vec<usize> {
+pub fn shown_at_first(volume: &Volume) -> Vec<u32> {
     let open = (0..volume.channels.len()).filter(|index| !volume.look(*index).hidden);
     let open: Vec<usize> = open.collect();
     let chosen = open.len() < volume.channels.len() && open.len() <= MOST_AT_FIRST;
@@ -118,7 +119,10 @@ fn shown_at_first(volume: &Volume) -> Vec<usize> {
     } else {
         SHOWN_AT_FIRST
     };
-    open.into_iter().take(most).collect()
+    let numbers = open
+        .into_iter()
+        .map(|index| u32::try_from(index).unwrap_or(u32::MAX));
+    numbers.take(most).collect()
 }
 
 /// Those that are seen, as renderers take them.

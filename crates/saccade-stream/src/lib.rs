@@ -47,7 +47,7 @@ mod session;
 #[cfg(not(target_family = "wasm"))]
 mod settle;
 
-pub use channels::Channel;
+pub use channels::{Channel, shown_at_first};
 pub use detail::Detail;
 pub use histogram::{Sample, sample};
 pub use session::{Again, Session, SessionError, SessionOptions, Status, TooLarge, TooMuch, Wake};

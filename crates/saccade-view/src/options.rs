@@ -6,7 +6,7 @@ use glam::UVec2;
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{TransferFunction, linear_from_srgb};
 use saccade_core::volume::Volume;
-use saccade_render::{ChannelError, FalseColors, Gpu, RendererError, View};
+use saccade_render::{ChannelError, FalseColors, Gpu, Mode, RendererError, View};
 use saccade_source::VolumeSource;
 use saccade_stream::policy::Limits;
 use saccade_stream::{Detail, Session, SessionError, SessionOptions, Wake};
@@ -147,6 +147,47 @@ impl ViewOptions {
         { self.show_channels(&mut session) }
             .map_err(|error| too_many(&error).unwrap_or(error.into()))?;
         Ok(session)
+    }
+
+    /// What was asked for and does not show in the first picture, in sentences that name the command line's options.
+    pub fn without_effect(&self, volume: &Volume) -> Vec<String> {
+        let mut told = Vec::new();
+        let shown = &self.shown;
+        let surfaces = shown.drawn_mode() == Mode::IsoSurface;
+        if shown.mode == Mode::IsoSurface && !surfaces {
+            told.push(
+                "--mode surface does not show in a plane alone, which has values as they are: --slab gives it a thickness"
+                    .to_owned(),
+            );
+        } else if !self.isos.is_empty() && !surfaces {
+            told.push(
+                "--iso shows where surfaces are drawn: add --mode surface, or leave it out"
+                    .to_owned(),
+            );
+        }
+        if shown.heat.is_some() && self.false_colors != FalseColors::None {
+            told.push(
+                "--false-colors does not show with --heat, which draws the work of rays instead"
+                    .to_owned(),
+            );
+        }
+        let seen = self.channels.clone();
+        let seen = seen.unwrap_or_else(|| saccade_stream::shown_at_first(volume));
+        let isos = self.isos.iter().filter(|_| surfaces);
+        let named = (self.transfers.iter().map(|(of, _)| ("--transfer", *of)))
+            .chain(self.details.iter().map(|(of, _)| ("--detail", *of)))
+            .chain(isos.map(|(of, _)| ("--iso", *of)));
+        for (option, of) in named {
+            if let Some(channel) = of
+                && !seen.contains(&channel)
+            {
+                told.push(format!(
+                    "{option} of channel {channel} does not show, nor does that channel: name it with --channels"
+                ));
+            }
+        }
+        told.dedup();
+        told
     }
 
     /// One picture of a volume.
@@ -350,6 +391,52 @@ mod tests {
             told.contains("\"15\"") && told.contains("from 16"),
             "{told}"
         );
+    }
+
+    #[test]
+    fn what_does_not_show_is_told() {
+        let size = glam::UVec3::new(90, 80, 70);
+        let mut volume = Volume::new("v", size, glam::DVec3::ONE).unwrap();
+        volume.channels = (0..6).map(|n| n.to_string()).collect();
+        let told = |options: &ViewOptions| options.without_effect(&volume).join("\n");
+        let surface = Shown {
+            mode: Mode::IsoSurface,
+            ..Shown::default()
+        };
+        let mut options = ViewOptions {
+            isos: vec![(Some(1), 0.5), (None, 0.2)],
+            transfers: vec![(None, None), (Some(3), None)],
+            details: vec![(Some(0), Detail::Full)],
+            ..ViewOptions::default()
+        };
+        assert!(told(&options).contains("--mode surface") && told(&options).lines().count() == 1);
+        options.shown = surface;
+        assert_eq!(told(&options), "");
+        // A plane alone shows values.
+        options.shown.slice = Some(crate::plane::Plane::through_voxel(2, 5.0));
+        assert!(told(&options).contains("--slab"));
+        options.shown.slab_nm = 9.0;
+        assert_eq!(told(&options), "");
+        // The first four are seen, unless others are named.
+        options.transfers.push((Some(4), None));
+        assert!(told(&options).contains("--transfer of channel 4"));
+        options.channels = Some(vec![4, 5]);
+        let all = told(&options);
+        for part in [
+            "--transfer of channel 3",
+            "--detail of channel 0",
+            "--iso of channel 1",
+        ] {
+            assert!(all.contains(part), "{part}: {all}");
+        }
+        assert_eq!(all.lines().count(), 3, "{all}");
+        options = ViewOptions {
+            false_colors: FalseColors::Level,
+            ..ViewOptions::default()
+        };
+        assert_eq!(told(&options), "");
+        options.shown.heat = crate::shown::heat_from_text("nodes").ok();
+        assert!(told(&options).contains("--heat"));
     }
 
     #[test]

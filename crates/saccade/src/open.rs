@@ -219,6 +219,9 @@ async fn first(archive: &VisualizationArchive) -> Result<Option<String>> {
     Ok(first)
 }
 
+/// Why an image has no use for what is said of stitching.
+pub(crate) const NOT_STITCHED: &str = "an image is not stitched, but read as it is";
+
 /// An open volume, and who knows how its acquisition is coming along.
 pub(crate) struct Opened {
     pub(crate) source: Arc<dyn VolumeSource>,
@@ -255,6 +258,7 @@ impl Place {
                     Ok(offered) => offered,
                     Err(error) if is_nobody(&error) => return Err(error.into()),
                     Err(no_server) => {
+                        stitching.refuse(NOT_STITCHED)?;
                         let opened = Self::image(&address.parse()?, name, images).await;
                         return opened.map_err(|error| match is_no_server(&no_server) {
                             true => error,
@@ -269,6 +273,7 @@ impl Place {
                         None => bail!("the server offers no volumes yet: {address}"),
                     },
                 };
+                stitching.refuse("what is behind an address was stitched by its server")?;
                 let source = RemoteSource::open(address, &name).await?;
                 for note in source.notes() {
                     say(note);
@@ -288,11 +293,14 @@ impl Place {
                     !catalog.is_given(),
                     "an image has no catalog: leave out --catalog"
                 );
+                stitching.refuse(NOT_STITCHED)?;
                 Self::image(location, name, images).await
             }
             Self::Bucket(_, location) if !catalog.is_given() => {
                 let opened = Self::image(location, name, images).await;
-                opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for")
+                let opened = opened.context("a visualization archive in a bucket needs --catalog; without it, an image is looked for")?;
+                stitching.refuse(NOT_STITCHED)?;
+                Ok(opened)
             }
             Self::Bucket(storage, _) | Self::Archive(storage) => {
                 let location = Self::archive(storage, catalog)?;

@@ -22,17 +22,17 @@ pub(crate) struct Stitching {
     interpolation: Option<Between>,
 
     /// What is seen where tiles overlap: the tile whose centre is nearest, or a mean that fades
-    /// towards each tile's edges
-    #[arg(long, value_enum, default_value_t = Overlapping::Nearest)]
-    overlaps: Overlapping,
+    /// towards each tile's edges [default: nearest]
+    #[arg(long, value_enum)]
+    overlaps: Option<Overlapping>,
 
-    /// What a voxel shows that spans several sections: the nearest one, or what lies between two
-    #[arg(long, value_enum, default_value_t = Sections::Nearest)]
-    along_z: Sections,
+    /// What a voxel shows that spans several sections: the nearest one, or what lies between two [default: nearest]
+    #[arg(long, value_enum)]
+    along_z: Option<Sections>,
 
-    /// Fill gaps of at most so many lost sections from those around them, see --along-z
-    #[arg(long, value_name = "SECTIONS", default_value_t = 0)]
-    fill_gaps: u32,
+    /// Fill gaps of at most so many lost sections from those around them, see --along-z [default: 0]
+    #[arg(long, value_name = "SECTIONS")]
+    fill_gaps: Option<u32>,
 
     /// Folder, on a fast local disk, that keeps what was stitched over restarts [default: none]
     #[arg(long, value_name = "FOLDER")]
@@ -106,6 +106,21 @@ enum Sections {
 }
 
 impl Stitching {
+    /// Refuses to be told how to stitch what is not stitched here, as in "an image is not stitched".
+    pub(crate) fn refuse(&self, why: &str) -> Result<()> {
+        let options = [
+            ("--interpolation", self.interpolation.is_some()),
+            ("--overlaps", self.overlaps.is_some()),
+            ("--along-z", self.along_z.is_some()),
+            ("--fill-gaps", self.fill_gaps.is_some()),
+            ("--disk-cache", self.disk_cache.is_some()),
+        ];
+        let given = options.into_iter().filter(|(_, given)| *given);
+        let given: Vec<&str> = given.map(|(option, _)| option).collect();
+        ensure!(given.is_empty(), "{why}: leave out {}", given.join(", "));
+        Ok(())
+    }
+
     /// How volumes of this archive are stitched. Opens the cache on disk as well; where that fails, says so and
     /// goes on without.
     ///
@@ -140,17 +155,17 @@ impl Stitching {
                 Between::Cubic => Interpolation::Cubic,
             }),
             overlaps: match self.overlaps {
-                Overlapping::Nearest => Overlaps::NearestCentre,
-                Overlapping::Blend => Overlaps::Blend,
+                None | Some(Overlapping::Nearest) => Overlaps::NearestCentre,
+                Some(Overlapping::Blend) => Overlaps::Blend,
             },
             along_z: match self.along_z {
-                Sections::Nearest => AlongZ::Nearest,
-                Sections::Linear => AlongZ::Linear,
+                None | Some(Sections::Nearest) => AlongZ::Nearest,
+                Some(Sections::Linear) => AlongZ::Linear,
             },
             gaps: match (self.fill_gaps, self.along_z) {
-                (0, _) => Gaps::Empty,
-                (most, Sections::Nearest) => Gaps::Nearest(most),
-                (most, Sections::Linear) => Gaps::Linear(most),
+                (None | Some(0), _) => Gaps::Empty,
+                (Some(most), None | Some(Sections::Nearest)) => Gaps::Nearest(most),
+                (Some(most), Some(Sections::Linear)) => Gaps::Linear(most),
             },
             disk_cache,
             ..StitchedOptions::default()

@@ -63,6 +63,9 @@ impl Render {
             .await?;
         let source = opened.source;
         options.check(source.volume())?;
+        for sentence in options.without_effect(source.volume()) {
+            say(&sentence);
+        }
         let gpu = Gpu::headless().await?;
         let view = options.view(source.volume(), self.size);
         let usual = SessionOptions::default();

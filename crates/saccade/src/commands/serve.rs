@@ -10,7 +10,7 @@ use saccade_serve::{Access, Options, Origins, Server, Volumes, follow_archive, o
 
 use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
-use crate::open::{Place, neither, waited_for};
+use crate::open::{NOT_STITCHED, Place, neither, waited_for};
 use crate::report::{say, tell};
 use crate::stitching::Stitching;
 
@@ -81,6 +81,7 @@ const POLL: Duration = Duration::from_secs(2);
 impl Serve {
     pub(crate) async fn run(self) -> Result<()> {
         if let Some(image) = self.place.open_to_serve(&self.catalog).await? {
+            self.stitching.refuse(NOT_STITCHED)?;
             let volumes = Volumes::new();
             volumes.publish(image, None);
             let server = Server::bind(self.at.address()).await?;

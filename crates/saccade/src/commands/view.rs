@@ -7,6 +7,7 @@ use saccade_view::{SourceSpec, run};
 use crate::arguments::CatalogArgument;
 use crate::looks::Looks;
 use crate::open::{Opened, Place};
+use crate::report::say;
 use crate::stitching::Stitching;
 
 /// Look at a volume in a window of its own.
@@ -44,6 +45,9 @@ impl View {
         } = opened;
         // Before there is a window.
         options.check(source.volume())?;
+        for sentence in options.without_effect(source.volume()) {
+            say(&sentence);
+        }
         Ok(run(
             SourceSpec::Open {
                 source,

@@ -14,6 +14,7 @@ mod images;
 mod kills;
 mod labels;
 mod lists;
+mod no_effect;
 #[allow(dead_code, reason = "others use more of it")]
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;
