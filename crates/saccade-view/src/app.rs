@@ -15,6 +15,7 @@ use web_time::Instant;
 
 use crate::acquisition::{Acquisition, AcquisitionReader};
 use crate::facts::{Facts, PageStatus, line};
+use crate::glyphs;
 use crate::navigate::{Input, moved};
 use crate::options::{OptionsError, ViewOptions};
 use crate::panel::{self, About, Open, Opener, Settings};
@@ -100,6 +101,7 @@ impl App {
     ) -> Result<Self, StartError> {
         let state = state_of(context)?;
         context.egui_ctx.set_theme(egui::Theme::Dark);
+        glyphs::provide(&context.egui_ctx);
         let window = Arc::new(Mutex::new(context.egui_ctx.clone()));
         let repaint = window.clone();
         let wake: Wake = Arc::new(move || lock(&repaint).request_repaint());

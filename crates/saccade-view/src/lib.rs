@@ -34,6 +34,7 @@ mod acquisition;
 mod app;
 mod detail;
 mod facts;
+mod glyphs;
 mod handover;
 mod navigate;
 mod options;
