@@ -1,7 +1,7 @@
 """Random reads of a sharded OME-Zarr by tensorstore.
 
-`write FOLDER EDGE SHARD CHUNK` writes the image. `read FOLDER X,Y,Z...` reads a cube of 64 voxels at each position, all of them
-asked for at once, and prints JSON: version, seconds, and the sum of all voxels.
+`write FOLDER EDGE SHARD CHUNK [checked]` writes the image, `checked` with a checksum of each chunk. `read FOLDER X,Y,Z...` reads a
+cube of 64 voxels at each position, all of them asked for at once, and prints JSON: version, seconds, and the sum of all voxels.
 """
 
 import json
@@ -15,8 +15,8 @@ import tensorstore
 CUBE = 64
 
 
-def write(folder, edge, shard, chunk):
-    codecs = [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 3}}]
+def write(folder, edge, shard, chunk, checked):
+    codecs = [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 3}}] + [{"name": "crc32c"}] * checked
     sharding = {"name": "sharding_indexed", "configuration": {
         "chunk_shape": [chunk] * 3, "codecs": codecs,
         "index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}]}}
@@ -52,6 +52,6 @@ def read(folder, positions):
 
 
 if sys.argv[1] == "write":
-    write(sys.argv[2], *map(int, sys.argv[3:6]))
+    write(sys.argv[2], *map(int, sys.argv[3:6]), checked=sys.argv[6:] == ["checked"])
 else:
     read(sys.argv[2], [tuple(map(int, text.split(","))) for text in sys.argv[3:]])
