@@ -74,10 +74,7 @@ fn a_damaged_tile_is_warned_of_once() {
     let (server, url) = Running::start(command.args(["serve", &archive, "--port", "0"]));
     let client = Client::of(&url);
     let failed = ask_for_all(&client);
-    assert!(
-        failed > damaged.len(),
-        "{failed} chunks show damaged tiles"
-    );
+    assert!(failed > damaged.len(), "{failed} chunks show damaged tiles");
     assert_eq!(ask_for_all(&client), failed);
     drop(server);
 
