@@ -263,12 +263,9 @@ impl Renderer {
     /// A ceiling that would do for any view of the channels that are seen, from the coarsest of the levels that they are drawn
     /// from \[bytes\]; `None` where no ceiling would.
     pub fn enough_memory(&self) -> Option<u64> {
-        let Ok((tables, (needs, _), device)) = needs(&self.gpu, &self.volume, &self.options, 1)
-        else {
-            return None;
-        };
+        let needed = needs(&self.gpu, &self.volume, &self.options, 1).ok()?;
         let levels = self.channels().map(|view| self.coarsest_of(view));
-        let bytes = Plan::needed_for(&tables, needs, levels, device)?;
+        let bytes = Plan::needed_for(&needed.tables, needed.needs, levels, needed.device)?;
         Some(bytes.saturating_add(self.options.picture_bytes))
     }
 

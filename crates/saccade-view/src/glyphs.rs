@@ -30,6 +30,8 @@ fn copy(height: f32) -> RasterizedGlyph {
     // Edges are a pixel soft.
     let covered = |distance: f32| (distance * size + 0.5).clamp(0.0, 1.0);
     let outline = |depth: f32| covered(depth).min(covered(line - depth));
+    #[expect(clippy::cast_possible_truncation, reason = "as large as a letter")]
+    #[expect(clippy::cast_sign_loss, reason = "4 at least")]
     let pixels = size as usize;
     let alpha = (0..pixels * pixels).map(|index| {
         let middle = |n: usize| (n as f32 + 0.5) / size;

@@ -20,13 +20,21 @@ pub(super) struct Planned {
     pub(super) plan: Plan,
 }
 
-/// What the caches of a volume are for, and what the device allows: with that many channels complete together.
+/// What the caches of a volume are for, and what the device allows.
+pub(super) struct Needed {
+    pub(super) tables: PageTables,
+    pub(super) needs: Needs,
+    octree: Option<Geometry>,
+    pub(super) device: DeviceLimits,
+}
+
+/// What a volume needs with that many channels complete together.
 pub(super) fn needs(
     gpu: &Gpu,
     volume: &Volume,
     options: &RendererOptions,
     seen: u32,
-) -> Result<(PageTables, (Needs, Option<Geometry>), DeviceLimits), RendererError> {
+) -> Result<Needed, RendererError> {
     let channels = u32::try_from(volume.channels.len()).unwrap_or(u32::MAX);
     let octree_slots = channels.min(u32::try_from(MOST_CHANNELS).expect("a few"));
     let shape = options.page_table_shape;
@@ -64,7 +72,12 @@ pub(super) fn needs(
         voxel_bytes: u32::try_from(volume.dtype.bytes()).expect("a few bytes"),
         channels: seen,
     };
-    Ok((tables, (needs, octree), device))
+    Ok(Needed {
+        tables,
+        needs,
+        octree,
+        device,
+    })
 }
 
 /// How a volume fits a device, so many channels of which are seen.
@@ -74,7 +87,12 @@ pub(super) fn planned(
     options: &RendererOptions,
     seen: u32,
 ) -> Result<Planned, RendererError> {
-    let (tables, (needs, octree), device) = needs(gpu, volume, options, seen)?;
+    let Needed {
+        tables,
+        needs,
+        octree,
+        device,
+    } = needs(gpu, volume, options, seen)?;
     let ceiling = options.memory_bytes;
     let picture = options.picture_bytes;
     let caches = ceiling.saturating_sub(picture);

@@ -171,7 +171,7 @@ async fn channels_that_do_not_fit_are_refused_and_what_would_do_does() {
         panic!("{refused:?}")
     };
     assert!(got == 16 && (1..16).contains(&most) && needed > one);
-    for (bytes, seen) in [(one, most as u32), (needed, 16)] {
+    for (bytes, seen) in [(one, u32::try_from(most).unwrap()), (needed, 16)] {
         let mut session = Session::new(&gpu, source.clone(), of(bytes, seen)).unwrap();
         let view = View {
             lod_bias: -2.0,
