@@ -59,11 +59,26 @@ async fn conditional(
 ) -> Response {
     let place = (piece.level, piece.chunk);
     let tag = published.tag(place);
-    if let Some(answer) = tag.precondition(headers) {
+    let looks = published.source.notices_by_reading();
+    if !looks && let Some(answer) = tag.precondition(headers) {
         return answer;
     }
     let mut reading = Box::pin(read(published.clone(), piece.clone()));
-    let voxels = match tokio::time::timeout(patience, &mut reading).await {
+    let outcome = tokio::time::timeout(patience, &mut reading).await;
+    if outcome.is_err() {
+        let what = Lingers::Piece(piece.level, piece.chunk, piece.channels.clone());
+        published.lingering.go_on(what, reading.map(drop));
+    }
+    // It may be the read that noticed a change: then the news is on its way.
+    let is_known = published.is_caught_up().await;
+    // What could not be read is not known to be another.
+    if looks
+        && is_known
+        && let Some(answer) = published.tag(place).precondition(headers)
+    {
+        return answer;
+    }
+    let voxels = match outcome {
         Ok(Ok(Some(voxels))) => voxels,
         Ok(Ok(None)) => {
             let (level, chunk) = place;
@@ -74,15 +89,9 @@ async fn conditional(
             return answer;
         }
         Ok(Err(error)) => return failed(published, &error),
-        Err(_) => {
-            let what = Lingers::Piece(piece.level, piece.chunk, piece.channels.clone());
-            published.lingering.go_on(what, reading.map(drop));
-            return late(published, place, patience);
-        }
+        Err(_) => return late(published, place, patience),
     };
     // A change during the read leaves open which state this is: then it goes without a tag.
-    // It may be the read that noticed it: then the news is on its way.
-    let is_known = published.is_caught_up().await;
     let tag = Some(tag).filter(|tag| is_known && published.tag(place) == *tag);
     let lasts = tag.is_some() && version.is_some_and(|v| published.is_as_in(v, place));
     let cache = if lasts { KEEP } else { REVALIDATE };

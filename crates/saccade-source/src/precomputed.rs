@@ -156,6 +156,10 @@ impl VolumeSource for PrecomputedSource {
     fn revision(&self) -> u64 {
         self.stored.revision()
     }
+
+    fn notices_by_reading(&self) -> bool {
+        self.stored.notices_by_reading()
+    }
 }
 
 /// The volume that an `info` describes.

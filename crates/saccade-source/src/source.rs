@@ -234,6 +234,12 @@ pub trait VolumeSource: MaybeSend + MaybeSync {
         None
     }
 
+    /// Whether a change is noticed only when something is read again, as of files of which nobody tells. Who holds a chunk and asks
+    /// whether it still is as it was has to read it.
+    fn notices_by_reading(&self) -> bool {
+        false
+    }
+
     /// Bounds of a chunk's measured values, if they are at hand.
     fn value_range(&self, _id: ChunkId) -> Option<ValueRange> {
         None

@@ -313,6 +313,10 @@ impl<F: Stored> VolumeSource for StoredSource<F> {
     fn revision(&self) -> u64 {
         self.watch.revision()
     }
+
+    fn notices_by_reading(&self) -> bool {
+        true
+    }
 }
 
 /// Says nothing of how much further levels lie where none does.

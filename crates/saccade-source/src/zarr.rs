@@ -203,6 +203,10 @@ impl VolumeSource for ZarrSource {
     fn revision(&self) -> u64 {
         self.stored.revision()
     }
+
+    fn notices_by_reading(&self) -> bool {
+        self.stored.notices_by_reading()
+    }
 }
 
 /// The JSON of an object; `None` if there is none.

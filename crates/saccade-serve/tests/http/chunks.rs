@@ -329,6 +329,7 @@ struct Rewritten {
     array: ArraySource,
     voxels: VoxelBox,
     is_rewritten: AtomicBool,
+    is_away: AtomicBool,
 }
 
 impl VolumeSource for Rewritten {
@@ -337,6 +338,14 @@ impl VolumeSource for Rewritten {
     }
 
     fn read(&self, id: ChunkId) -> BoxFuture<'_, Result<Chunk, ChunkError>> {
+        if self.is_away.load(Ordering::SeqCst) {
+            let failed = ChunkError::Failed {
+                id,
+                transient: true,
+                source: Arc::new(std::io::Error::other("the disk is away")),
+            };
+            return Box::pin(std::future::ready(Err(failed)));
+        }
         if self.is_rewritten.swap(false, Ordering::SeqCst) {
             self.array.set(self.voxels, &[77]).unwrap();
         }
@@ -350,6 +359,10 @@ impl VolumeSource for Rewritten {
     fn revision(&self) -> u64 {
         self.array.revision()
     }
+
+    fn notices_by_reading(&self) -> bool {
+        true
+    }
 }
 
 /// Also in the answer of the very read that noticed it: equal tags, equal bytes.
@@ -361,6 +374,7 @@ fn voxels_that_turn_out_to_be_others_have_another_tag() {
             array: ArraySource::new(volume(), level0()).unwrap(),
             voxels: VoxelBox::new(min, min + 1),
             is_rewritten: AtomicBool::new(false),
+            is_away: AtomicBool::new(false),
         });
         let (url, _stop, _) = serve_source(source.clone(), Options::DEFAULT).await;
         let client = reqwest::Client::new();
@@ -385,6 +399,21 @@ fn voxels_that_turn_out_to_be_others_have_another_tag() {
             let (now, third, voxels) = get(Some(&first)).await;
             assert_eq!((now, voxels), (StatusCode::OK, after));
             assert!(second.is_none() || second == third, "{second:?} {third:?}");
+
+            // Who asks only whether it is as it was, and nobody else, learns of it, too.
+            let third = third.unwrap();
+            source.is_rewritten.store(true, Ordering::SeqCst);
+            let (now, fourth, _) = get(Some(&third)).await;
+            assert_eq!(now, StatusCode::OK);
+            assert_ne!(fourth.as_ref(), Some(&third));
+            // What cannot be read now is not known to be another.
+            let (_, fourth, _) = get(None).await;
+            source.is_away.store(true, Ordering::SeqCst);
+            let (now, ..) = get(fourth.as_deref()).await;
+            assert_eq!(now, StatusCode::NOT_MODIFIED);
+            let (now, ..) = get(Some(&third)).await;
+            assert!(now.is_server_error(), "{now}");
+            source.is_away.store(false, Ordering::SeqCst);
         }
     });
 }
