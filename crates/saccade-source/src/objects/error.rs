@@ -31,7 +31,7 @@ pub enum ObjectError {
         location: String,
     },
     /// The store answers with something else than the object.
-    #[error("the answer is {answer}, not the object: {location}")]
+    #[error("instead of the object, the answer is {answer}: {location}")]
     Answer {
         /// What came.
         answer: String,

@@ -33,6 +33,9 @@ const CREDENTIALS: [&str; 5] = [
     "AWS_CONTAINER_CREDENTIALS_FULL_URI",
 ];
 
+/// Of which one is nothing without the other.
+const KEYS: [&str; 2] = ["AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"];
+
 /// Objects in a bucket of a store that speaks S3, below a prefix.
 ///
 /// Requests are signed where the environment has credentials (`AWS_ACCESS_KEY_ID` and the others that
@@ -76,12 +79,16 @@ impl S3Objects {
     ) -> Result<Self, LocationError> {
         let mut known = Vec::new();
         let (mut anonymous, mut find_region) = (true, true);
+        let mut keys = KEYS.map(|_| false);
         for (name, value) in settings {
             let name = name.to_ascii_uppercase();
             if !name.starts_with("AWS_") || value.is_empty() {
                 continue;
             }
             anonymous &= !CREDENTIALS.contains(&&*name);
+            for (key, is_set) in KEYS.iter().zip(&mut keys) {
+                *is_set |= *key == name;
+            }
             find_region &= !name.contains("REGION") && !name.contains("ENDPOINT");
             if name.starts_with("AWS_ENDPOINT") && value.starts_with("http://") {
                 known.push((
@@ -94,6 +101,13 @@ impl S3Objects {
             if let Ok(key) = name.to_ascii_lowercase().parse::<AmazonS3ConfigKey>() {
                 known.push((key, value));
             }
+        }
+        if keys[0] != keys[1] {
+            let reason = format!(
+                "{} and {} belong together: set both, or none for a public bucket",
+                KEYS[0], KEYS[1]
+            );
+            return Err(LocationError::new(&location.to_string(), reason));
         }
         let objects = Self {
             location: location.clone(),
@@ -355,5 +369,31 @@ impl Objects for S3Objects {
 
     fn read_cost(&self) -> u64 {
         256 << 10
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_of_the_credentials_is_told_as_such() {
+        let location: BucketLocation = "s3://bucket/image.zarr".parse().unwrap();
+        let with = |names: &[&str]| {
+            let settings = names
+                .iter()
+                .map(|name| ((*name).to_owned(), "x".to_owned()));
+            let settings = settings.chain([("AWS_REGION".to_owned(), "eu-west-1".to_owned())]);
+            S3Objects::with_settings(&location, settings, Patience::default())
+        };
+        for half in KEYS {
+            let told = with(&[half]).unwrap_err().to_string();
+            assert!(
+                KEYS.iter().all(|key| told.contains(key)) && told.contains("set both"),
+                "{told}"
+            );
+        }
+        with(&[]).unwrap();
+        with(&KEYS).unwrap();
     }
 }

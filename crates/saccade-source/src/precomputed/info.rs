@@ -149,7 +149,8 @@ impl Scale {
             .ok_or_else(|| wrong("a level (scale) has no key"))?;
         if !crate::objects::is_key(key) {
             return Err(wrong(format!(
-                "the level {key:?} lies outside of the volume"
+                "the level {key:?} lies outside of the volume, or its parts are empty or dots: name it as its folder is, such as \
+                 \"8_8_30\""
             )));
         }
         let size = extent(&json["size"], "size")?;
@@ -253,7 +254,12 @@ impl Sharding {
             murmur: match json["hash"].as_str() {
                 Some("identity") => false,
                 Some("murmurhash3_x86_128") => true,
-                other => return Err(unsupported(format!("its shards are hashed by {other:?}"))),
+                Some(other) => {
+                    return Err(unsupported(format!(
+                        "its shards are hashed by {other:?}; identity and murmurhash3_x86_128 are known"
+                    )));
+                }
+                None => return Err(wrong("it does not say how its shards are hashed (hash)")),
             },
             minishard_bits: bits("minishard_bits", 60)?,
             shard_bits: bits("shard_bits", 64)?,

@@ -124,6 +124,7 @@ impl Array {
         {
             return Err(Refusal::wrong("a level is listed, but is no array"));
         }
+        format_is(json, 3)?;
         let understood = |(key, value): (&String, &Value)| {
             KNOWN.contains(&key.as_str()) || value["must_understand"] == false
         };
@@ -151,13 +152,7 @@ impl Array {
             Some(name) => Number::named(name).ok_or_else(|| unknown_number(name))?,
             None => return Err(unknown_number(&json["data_type"].to_string())),
         };
-        let encoding = &json["chunk_key_encoding"];
-        let separator = &encoding["configuration"]["separator"];
-        let prefixed = encoding["name"].as_str() != Some("v2");
-        let keys = Keys {
-            prefixed,
-            separator: separator_of(separator, if prefixed { '/' } else { '.' })?,
-        };
+        let keys = keys_3(&json["chunk_key_encoding"])?;
         let codecs = json["codecs"].as_array();
         let codecs = codecs.ok_or_else(|| Refusal::wrong("it has no codecs"))?;
         let rank = shape.len();
@@ -184,6 +179,7 @@ impl Array {
 
     /// Of a `.zarray`, version 2.
     pub(super) fn version_2(json: &Value) -> Result<Self, Refusal> {
+        format_is(json, 2)?;
         let (shape, chunk) = shapes(&json["shape"], &json["chunks"])?;
         let dtype = &json["dtype"];
         let (number, big_endian) = dtype_2(dtype.as_str()).ok_or_else(|| match dtype.as_str() {
@@ -278,6 +274,39 @@ fn unknown_number(name: &str) -> Refusal {
         "its values are {name}; whole numbers of 8 to 64 bit and floating-point ones of 32 and 64 bit \
          are shown: convert them"
     ))
+}
+
+/// Refuses metadata of another version than their file's name says.
+fn format_is(json: &Value, version: u64) -> Result<(), Refusal> {
+    match &json["zarr_format"] {
+        format if *format == version || format.is_null() => Ok(()),
+        other => Err(Refusal::Unsupported(format!(
+            "its zarr_format is {other}; versions 2, in .zarray, and 3, in zarr.json, are known"
+        ))),
+    }
+}
+
+/// Of version 3, which allows for others than the two that are known here.
+fn keys_3(encoding: &Value) -> Result<Keys, Refusal> {
+    // Some write a plain name where nothing is configured.
+    let name = encoding["name"].as_str().or(encoding.as_str());
+    let separator = &encoding["configuration"]["separator"];
+    let (prefixed, default) = match name {
+        Some("default") => (true, '/'),
+        Some("v2") => (false, '.'),
+        None if encoding.is_null() => (true, '/'),
+        _ => {
+            let name = name.map_or_else(|| encoding.to_string(), |name| format!("{name:?}"));
+            return Err(Refusal::Unsupported(format!(
+                "its chunks are named in another way (chunk_key_encoding) than \"default\" or \"v2\", which are known: {name}"
+            )));
+        }
+    };
+    let separator = separator_of(separator, default)?;
+    Ok(Keys {
+        prefixed,
+        separator,
+    })
 }
 
 fn separator_of(value: &Value, default: char) -> Result<char, Refusal> {
@@ -476,9 +505,24 @@ fn dtype_2(name: Option<&str>) -> Option<(Number, bool)> {
     }
 }
 
+/// The bytes, highest first, of a floating-point number whose bits are told: `0x7fc00000`.
+fn bits_of(text: &str, number: Number) -> Option<Vec<u8>> {
+    let digits = text.strip_prefix("0x")?;
+    let is_float = matches!(number, Number::F32 | Number::F64);
+    let fits = digits.len() == 2 * number.bytes() && digits.bytes().all(|b| b.is_ascii_hexdigit());
+    let byte = |at: usize| u8::from_str_radix(digits.get(2 * at..2 * at + 2)?, 16).ok();
+    (is_float && fits).then(|| (0..number.bytes()).map(byte).collect())?
+}
+
 /// The number of what is not stored, as it would be; 0 where nothing is said.
 fn fill_3(value: &Value, number: Number, big_endian: bool) -> Result<Vec<u8>, Refusal> {
     let unknown = || Refusal::Wrong(format!("its fill value {value} is no {number}"));
+    if let Some(mut bytes) = value.as_str().and_then(|text| bits_of(text, number)) {
+        if !big_endian {
+            bytes.reverse();
+        }
+        return Ok(bytes);
+    }
     let float = match value.as_str() {
         Some("NaN") => Some(f64::NAN),
         Some("Infinity") => Some(f64::INFINITY),

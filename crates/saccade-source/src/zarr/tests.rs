@@ -478,6 +478,19 @@ fn other_types_and_absurd_shapes_are_refused() {
             "\"wrapped\":{\"name\":\"x\"},\"node_type\"",
             "it has \"wrapped\", which is not known",
         ),
+        // What would make every chunk a missing one.
+        (
+            "key encoding",
+            "\"name\":\"default\"",
+            "\"name\":\"suffix\"",
+            "named in another way (chunk_key_encoding)",
+        ),
+        (
+            "version",
+            "\"zarr_format\":3",
+            "\"zarr_format\":4",
+            "its zarr_format is 4",
+        ),
         (
             "key",
             "\"node_type\"",
@@ -493,6 +506,33 @@ fn other_types_and_absurd_shapes_are_refused() {
         fs::write(&file, text.replace(from, to)).unwrap();
         let refusal = refusal(&folder);
         assert!(refusal.contains(words), "{what}: {refusal}");
+    }
+}
+
+/// Version 3 tells the bits of floating-point numbers that have no other name.
+#[test]
+fn fill_values_may_be_told_by_their_bits() {
+    for (fill, dtype, filled) in [
+        ("0x40490fdb", "float32", true),
+        ("0x400921fb54442d18", "float64", true),
+        ("0x40490fd", "float32", false),
+        ("0x40490fdb", "float64", false),
+        ("0x4049zfdb", "float32", false),
+        ("0x00000005", "uint32", false),
+    ] {
+        let metadata = json!({"zarr_format": 3, "node_type": "array", "shape": [4, 5, 6],
+            "data_type": dtype, "fill_value": fill,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2, 5, 6]}},
+            "chunk_key_encoding": {"name": "default"},
+            "codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]});
+        let array = Array::version_3(&metadata);
+        assert_eq!(array.is_ok(), filled, "{fill} {dtype}");
+        let Ok(array) = array else { continue };
+        let value = match dtype {
+            "float32" => f64::from(f32::from_le_bytes(array.fill.try_into().unwrap())),
+            _ => f64::from_le_bytes(array.fill.try_into().unwrap()),
+        };
+        assert!((value - std::f64::consts::PI).abs() < 1e-6, "{value}");
     }
 }
 
