@@ -171,6 +171,30 @@ pub(crate) fn is_project(path: &Path) -> bool {
     readable(&text).contains("t2_patch")
 }
 
+/// Where the transform of a tile puts its corner.
+fn transformed_corner(spec: &TileSpec) -> DVec2 {
+    spec.transform.apply(TilePoint(DVec2::ZERO)).0
+}
+
+/// Whether the stage's places are like the transforms', but for where both begin: within a tile's size for three tiles of four. Some
+/// microscopes write nanometers, or steps of a motor, which would make of a section one that is many times as large.
+fn stage_counts_pixels(specs: &[TileSpec]) -> bool {
+    let apart = |spec: &TileSpec| Some(transformed_corner(spec) - spec.stage?);
+    let apart: Vec<DVec2> = specs.iter().filter_map(apart).collect();
+    let middle = |axis: usize| {
+        let mut all: Vec<f64> = apart.iter().map(|apart| apart[axis]).collect();
+        let middle = all.len() / 2;
+        match middle < all.len() {
+            true => *all.select_nth_unstable_by(middle, f64::total_cmp).1,
+            false => 0.0,
+        }
+    };
+    let middle = DVec2::new(middle(0), middle(1));
+    let tile = { specs.iter() }.fold(0, |most, spec| most.max(spec.size.max_element()));
+    let near = |apart: &&DVec2| (**apart - middle).abs().max_element() <= f64::from(tile);
+    4 * apart.iter().filter(near).count() >= 3 * apart.len()
+}
+
 fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
     let transforms = tiles.iter().map(|tile| {
         let transform = SectionFromTile::translation(tile.corner);
@@ -182,13 +206,18 @@ fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
     }
 }
 
-/// Of tiles that know no stage, the transform says roughly where it was.
+/// Of tiles that know no stage, or one that does not count pixels, the transform says roughly where it was.
 fn of_specs(path: &Path, specs: &[TileSpec]) -> List {
+    let counts = stage_counts_pixels(specs);
+    if !counts {
+        log::warn!(
+            "the stage's places (layout) are not in pixels, or other than the transforms', and are passed over: {}",
+            path.display()
+        );
+    }
     let tiles = specs.iter().map(|spec| ListedTile {
         file: spec.file.clone(),
-        corner: spec
-            .stage
-            .unwrap_or_else(|| spec.transform.apply(TilePoint(DVec2::ZERO)).0),
+        corner: { spec.stage.filter(|_| counts) }.unwrap_or_else(|| transformed_corner(spec)),
         section: spec.section,
     });
     let transforms = specs

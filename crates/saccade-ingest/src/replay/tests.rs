@@ -240,17 +240,15 @@ fn tile_specs_hold_stage_and_solution() {
             stage[0], stage[1]
         )
     };
-    let write = |b: &str| {
-        let specs = [
-            spec("a", [1000.0, 500.0], "1 0 0 1 0 0"),
-            spec("b", [1027.0, 500.0], b),
-        ];
+    let write_at = |stages: [[f64; 2]; 2], b: &str| {
+        let specs = [spec("a", stages[0], "1 0 0 1 0 0"), spec("b", stages[1], b)];
         fs::write(
             folder.path().join("specs.json"),
             format!("[{}]", specs.join(",")),
         )
         .unwrap();
     };
+    let write = |b: &str| write_at([[1000.0, 500.0], [1027.0, 500.0]], b);
     fs::write(folder.path().join("other.json"), r#"{"microscope": 7}"#).unwrap();
     write("1 0.01 -0.01 1 26 2");
     let acquisition = found(folder.path());
@@ -264,6 +262,14 @@ fn tile_specs_hold_stage_and_solution() {
     // A solution that says what the stage says is none.
     write("1 0 0 1 27 0");
     assert_eq!(found(folder.path()).solution, None);
+
+    // A stage that counts nanometers, or goes elsewhere, says nothing of where pixels lie.
+    for (x, y) in [(1_108_000.0, 500_000.0), (1_000_000.0, 499_900.0)] {
+        write_at([[1_000_000.0, 500_000.0], [x, y]], "1 0 0 1 26 2");
+        let acquisition = found(folder.path());
+        assert_eq!(acquisition.extent, UVec3::new(56, 22, 1));
+        assert_eq!(steps(&acquisition).0, DVec2::new(26.0, 2.0));
+    }
 }
 
 #[test]
