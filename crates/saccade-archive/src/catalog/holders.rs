@@ -6,6 +6,9 @@ use std::path::Path;
 
 use super::sqlite::{FileId, log_of, shared_memory_of};
 
+/// Times that the system is asked, until it names somebody.
+const LOOKS: u32 = 5;
+
 /// Other programs of this machine that have locked the file, or what SQLite keeps beside it, for writing, such as
 /// `sqlite3 (process 17)`; none where the system does not tell.
 pub(super) fn of(path: &Path) -> Vec<String> {
@@ -14,12 +17,9 @@ pub(super) fn of(path: &Path) -> Vec<String> {
         .filter_map(|file| FileId::of(file).ok())
         .map(|id| id.inode)
         .collect();
-    let locks = fs::read_to_string("/proc/locks").unwrap_or_default();
-    let holders: BTreeSet<u32> = { locks.lines() }
-        .filter_map(writer)
-        .filter(|(process, inode)| *process != std::process::id() && inodes.contains(inode))
-        .map(|(process, _)| process)
-        .collect();
+    // The system writes the list in pieces, and passes one over where others lock and unlock meanwhile.
+    let listed = (0..LOOKS).map(|_| writers(&inodes));
+    let holders = { listed }.find(|holders| !holders.is_empty());
     let name = |process: u32| {
         let name = fs::read_to_string(format!("/proc/{process}/comm")).unwrap_or_default();
         match name.trim() {
@@ -27,7 +27,17 @@ pub(super) fn of(path: &Path) -> Vec<String> {
             name => format!("{name} (process {process})"),
         }
     };
-    holders.into_iter().map(name).collect()
+    holders.into_iter().flatten().map(name).collect()
+}
+
+/// Other processes that have locked one of the files for writing, by what the system says now.
+fn writers(inodes: &[u64]) -> BTreeSet<u32> {
+    let locks = fs::read_to_string("/proc/locks").unwrap_or_default();
+    { locks.lines() }
+        .filter_map(writer)
+        .filter(|(process, inode)| *process != std::process::id() && inodes.contains(inode))
+        .map(|(process, _)| process)
+        .collect()
 }
 
 /// The process that has a lock for writing, and the number of its file, from a line such as
