@@ -29,15 +29,18 @@
 mod clock;
 mod commit;
 mod database;
+mod entries;
 mod error;
 mod holders;
 mod identity;
 mod location;
 mod origins;
 mod postgres;
+mod remembered;
 mod rows;
 mod spoilt;
 mod sqlite;
+mod tiles;
 mod watcher;
 mod workers;
 
@@ -45,19 +48,18 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::SystemTime;
 
-use glam::{DVec3, UVec2, UVec3};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Volume, check_name};
-use saccade_core::voxel_box::VoxelBox;
-use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
-
-use crate::acquisition::{Cursor, TileRecord};
 
 use database::{Database, Durability, Row, Statement, Transaction, Value};
 
 pub use clock::{Clock, SystemClock};
 pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
+pub use entries::{
+    CatalogChange, ChangeReason, NewTile, Quarantined, Retired, Statistics, Tile, TileId,
+    VolumeEntry, Waiting, place,
+};
 pub use error::CatalogError;
 pub use location::CatalogLocation;
 pub use origins::Origin;
@@ -69,161 +71,6 @@ pub const CHANGES_AT_ONCE: usize = 4096;
 
 /// Changes that are kept of each volume, at least: the newest.
 pub const CHANGES_KEPT: u64 = 1 << 16;
-
-/// Names a tile within its catalog, for good.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct TileId(pub i64);
-
-/// A tile whose pyramid is in the visualization archive.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Tile {
-    /// Its id; stays when it is imaged again.
-    pub id: TileId,
-    /// Its name, unique in the volume.
-    pub name: String,
-    /// Section: z index of the volume.
-    pub section: u32,
-    /// Channel: index in the volume's channels.
-    pub channel: u32,
-    /// Width and height \[pixels\].
-    pub size: UVec2,
-    /// Where it lies: to level-0 voxels from pixels.
-    pub transform: SectionFromTile,
-    /// Name of its pyramid in the storage. Another image gets another name.
-    pub pyramid: String,
-    /// The volume's revision when the tile last changed.
-    pub revision: u64,
-}
-
-/// A tile to be entered.
-#[derive(Clone, Debug, PartialEq)]
-pub struct NewTile {
-    /// Its name. If the volume has a tile of that name, the newer position wins.
-    pub name: String,
-    /// Section: z index of the volume.
-    pub section: u32,
-    /// Channel: index in the volume's channels.
-    pub channel: u32,
-    /// Width and height \[pixels\].
-    pub size: UVec2,
-    /// To level-0 voxels from pixels.
-    pub transform: SectionFromTile,
-    /// Name of its pyramid, already durable in the storage.
-    pub pyramid: String,
-    /// Position of its record: a larger one is newer, the same one is the same record.
-    pub position: u64,
-}
-
-/// Why voxels changed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ChangeReason {
-    /// A tile arrived, or arrived again.
-    Tile,
-    /// A tile moved.
-    Transform,
-    /// A tile was deleted.
-    Deleted,
-}
-
-/// Voxels that are no longer what they were.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct CatalogChange {
-    /// The volume's revision after it.
-    pub revision: u64,
-    /// The tile.
-    pub tile: TileId,
-    /// Its section.
-    pub section: u32,
-    /// Where, inside the volume \[level-0 voxels\].
-    pub voxels: VoxelBox,
-    /// Why.
-    pub reason: ChangeReason,
-}
-
-/// A file or record that could not become a tile.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Quarantined {
-    /// The file, relative to the acquisition archive.
-    pub file: String,
-    /// The tile it was to become, if known. A good record of that tile ends its quarantine.
-    pub tile: Option<String>,
-    /// What is wrong and how to mend it.
-    pub reason: String,
-    /// The file's size \[bytes\], if it exists.
-    pub bytes: Option<u64>,
-    /// When.
-    pub at: SystemTime,
-}
-
-/// A record whose file is not whole yet.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Waiting {
-    /// Position of the record.
-    pub position: u64,
-    /// The record.
-    pub record: TileRecord,
-    /// What it waits for.
-    pub reason: String,
-}
-
-/// A pyramid that no tile names any more.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Retired {
-    /// Its name in the storage.
-    pub pyramid: String,
-    /// Since when.
-    pub at: SystemTime,
-}
-
-/// A volume and how far it is.
-#[derive(Clone, Debug, PartialEq)]
-pub struct VolumeEntry {
-    /// What it is.
-    pub volume: Volume,
-    /// Its newest revision; 0 while empty.
-    pub revision: u64,
-    /// Tiles it has.
-    pub tiles: u64,
-}
-
-/// Counts of a volume.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct Statistics {
-    /// Newest revision.
-    pub revision: u64,
-    /// Tiles.
-    pub tiles: u64,
-    /// Sections that have a tile.
-    pub sections: u64,
-    /// Files in quarantine.
-    pub quarantined: u64,
-    /// Tiles whose file is not whole yet.
-    pub waiting: u64,
-    /// Tiles that were announced and are still to be worked on, or are being worked on.
-    pub queued: u64,
-    /// Transforms whose tile has not come yet.
-    pub early: u64,
-}
-
-/// Where a tile lies in a volume of `extent` \[level-0 voxels\], cut at the volume's faces; `None`
-/// if it is wholly outside.
-pub fn place(
-    extent: UVec3,
-    section: u32,
-    size: UVec2,
-    transform: SectionFromTile,
-) -> Option<VoxelBox> {
-    let (min, max) = transform.bounds(size.as_dvec2());
-    let z = f64::from(section);
-    let tile = VoxelBox::around(
-        DVec3::new(min.0.x, min.0.y, z),
-        DVec3::new(max.0.x, max.0.y, z + 1.0),
-    );
-    let inside = tile.intersection(VoxelBox::of_size(extent));
-    (!inside.is_empty()).then_some(inside)
-}
 
 /// An open catalog. Clones share it.
 #[derive(Clone, Debug)]
@@ -410,71 +257,11 @@ impl Catalog {
     pub async fn volumes(&self) -> Result<Vec<Listed>, CatalogError> {
         let question = "SELECT name, description, revision, tiles FROM volumes ORDER BY name";
         let listed = |row: &Row| {
-            let name: String = row.get("name")?;
+            let name = rows::legible(row, "name");
             let entry = self.described(&name, row);
             Ok(Listed { name, entry })
         };
         self.ask(question, &[], listed).await
-    }
-
-    /// The tiles of a section, by id.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltTile`] where [`Self::section_rows`] has one, or what the
-    /// database says.
-    pub async fn section_tiles(&self, volume: &str, z: u32) -> Result<Vec<Tile>, CatalogError> {
-        let rows = self.section_rows(volume, z).await?;
-        self.whole(volume, rows)
-    }
-
-    /// The tile of that name, if the volume has it.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltTile`], or what the database says.
-    pub async fn tile(&self, volume: &str, name: &str) -> Result<Option<Tile>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                        pyramid, revision FROM tiles \
-                        WHERE volume = $1 AND name = $2 AND deleted = 0";
-        let values = [id.into(), name.into()];
-        let rows = self.ask(question, &values, rows::tile_or_spoilt).await?;
-        Ok(self.whole(volume, rows)?.pop())
-    }
-
-    /// The tiles of these ids, by id; those that the volume has not are left out.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltTile`], or what the database says.
-    pub async fn tiles(&self, volume: &str, ids: &[TileId]) -> Result<Vec<Tile>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = Statement {
-            sqlite: "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                     pyramid, revision FROM tiles \
-                     WHERE id IN (SELECT value FROM json_each($1)) AND volume = $2 \
-                     AND deleted = 0 ORDER BY id",
-            postgres: "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                       pyramid, revision FROM tiles \
-                       WHERE id IN (SELECT value::bigint FROM json_array_elements_text($1::text::json)) \
-                       AND volume = $2 AND deleted = 0 ORDER BY id",
-        };
-        let ids = serde_json::to_string(ids).expect("numbers become JSON");
-        let values = [(&ids).into(), id.into()];
-        let rows = self.ask(question, &values, rows::tile_or_spoilt).await?;
-        self.whole(volume, rows)
-    }
-
-    /// The sections that have a tile, ascending.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn sections(&self, volume: &str) -> Result<Vec<u32>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT section FROM sections WHERE volume = $1 ORDER BY section";
-        self.ask(question, &[id.into()], rows::section).await
     }
 
     /// A volume's newest revision; 0 while it is empty.
@@ -619,133 +406,6 @@ impl Catalog {
         Ok(())
     }
 
-    /// The files in quarantine, oldest first.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn quarantined(&self, volume: &str) -> Result<Vec<Quarantined>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question =
-            "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = $1 ORDER BY id";
-        self.ask(question, &[id.into()], rows::quarantined).await
-    }
-
-    /// The first `most` of them.
-    ///
-    /// # Errors
-    ///
-    /// As [`Self::quarantined`].
-    pub async fn first_quarantined(
-        &self,
-        volume: &str,
-        most: u32,
-    ) -> Result<Vec<Quarantined>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = $1 \
-                        ORDER BY id LIMIT $2";
-        let values = [id.into(), most.into()];
-        self.ask(question, &values, rows::quarantined).await
-    }
-
-    /// How far the records were read.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn cursor(&self, volume: &str) -> Result<Cursor, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT byte, line, seen FROM cursors WHERE volume = $1";
-        let found = self.ask(question, &[id.into()], rows::cursor).await?;
-        Ok(found.into_iter().next().unwrap_or_default())
-    }
-
-    /// The records whose file is not whole yet, by position.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn waiting(&self, volume: &str) -> Result<Vec<Waiting>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT position, record, reason FROM waiting \
-                        WHERE volume = $1 AND parked = 1 ORDER BY position";
-        self.ask(question, &[id.into()], rows::waiting).await
-    }
-
-    /// Pyramids that no tile has named since `before`, at most `max`.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn retired(
-        &self,
-        volume: &str,
-        before: SystemTime,
-        max: u32,
-    ) -> Result<Vec<Retired>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question =
-            "SELECT pyramid, at FROM retired WHERE volume = $1 AND at < $2 ORDER BY at LIMIT $3";
-        let values = [id.into(), rows::millis(before).into(), max.into()];
-        self.ask(question, &values, rows::retired).await
-    }
-
-    /// Counts. Cheap at any number of tiles.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn statistics(&self, volume: &str) -> Result<Statistics, CatalogError> {
-        let question = "SELECT v.revision, v.tiles, \
-                        (SELECT count(*) FROM sections WHERE volume = v.id) AS sections, \
-                        (SELECT count(*) FROM quarantine WHERE volume = v.id) AS quarantined, \
-                        (SELECT count(*) FROM waiting WHERE volume = v.id AND parked = 1) AS waiting, \
-                        (SELECT count(*) FROM waiting WHERE volume = v.id AND parked = 0) AS queued, \
-                        (SELECT count(*) FROM early_transforms WHERE volume = v.id) AS early \
-                        FROM volumes v WHERE v.name = $1";
-        let found = self
-            .ask(question, &[volume.into()], rows::statistics)
-            .await?;
-        match found.into_iter().next() {
-            Some(statistics) => Ok(statistics),
-            None => Err(self.unknown_volume(volume).await),
-        }
-    }
-
-    /// The sections that have a tile, by looking at the tiles themselves: what [`Self::sections`] should say.
-    ///
-    /// # Errors
-    ///
-    /// As [`Self::sections`].
-    pub async fn sections_of_tiles(&self, volume: &str) -> Result<Vec<u32>, CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let question = "SELECT DISTINCT section FROM tiles WHERE volume = $1 AND deleted = 0 \
-                        ORDER BY section";
-        self.ask(question, &[id.into()], rows::section).await
-    }
-
-    /// Counts a volume's tiles anew, in all and by section.
-    ///
-    /// # Errors
-    ///
-    /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn recount(&self, volume: &str) -> Result<(), CatalogError> {
-        let id = self.volume_id(volume).await?;
-        let mut transaction = self.transaction(Durability::Durable).await?;
-        for statement in [
-            "UPDATE volumes SET tiles = \
-             (SELECT count(*) FROM tiles WHERE volume = $1 AND deleted = 0) WHERE id = $1",
-            "DELETE FROM sections WHERE volume = $1",
-            "INSERT INTO sections (volume, section, tiles) SELECT volume, section, count(*) \
-             FROM tiles WHERE volume = $1 AND deleted = 0 GROUP BY volume, section",
-        ] {
-            let done = transaction.run(statement, &[id.into()]).await;
-            done.map_err(|e| self.failed(e))?;
-        }
-        let done = transaction.commit().await;
-        done.map_err(|e| self.failed(e))
-    }
-
     /// Ends all connections. Without it they end when the last clone is dropped, in their own time.
     pub async fn close(&self) {
         self.inner.database.close().await;
@@ -810,7 +470,8 @@ impl Catalog {
 
     async fn unknown_volume(&self, name: &str) -> CatalogError {
         let question = "SELECT name FROM volumes ORDER BY name";
-        match self.ask(question, &[], |row| row.get("name")).await {
+        let legible = |row: &Row| Ok(rows::legible(row, "name"));
+        match self.ask(question, &[], legible).await {
             Ok(known) => CatalogError::UnknownVolume {
                 name: name.to_owned(),
                 known,

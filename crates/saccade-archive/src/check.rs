@@ -3,24 +3,30 @@
 //! Objects are listed first and the catalog is read afterwards, so that a running ingest disturbs
 //! nothing: what it enters meanwhile is named by then, and what it is about to enter is young.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::HashSet;
 use std::hash::{BuildHasher, RandomState};
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use futures::{StreamExt as _, stream};
-use serde::Serialize;
 
 use crate::VisualizationArchive;
-use crate::acquisition::{Cursor, Record, RecordReader, TileRecord, image_path};
-use crate::catalog::{CatalogError, Origin, Quarantined, Tile, VolumeEntry, Waiting, place};
+use crate::acquisition::Cursor;
+use crate::catalog::{CatalogError, Tile, VolumeEntry, place};
 use crate::pyramid::{self, PyramidError, Verified};
-use crate::storage::{Entry, StorageError};
+use crate::storage::StorageError;
 
 mod misplaced;
+mod orphans;
+mod records;
+mod repair;
+mod report;
+mod shared;
 #[cfg(test)]
 mod tests;
+
+pub use report::{CheckReport, Finding, FindingKind, Repair, count};
 
 /// What to look at, and what to do about it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -53,108 +59,6 @@ impl Default for CheckOptions {
     }
 }
 
-/// What was looked at, and what was found.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct CheckReport {
-    /// Tiles that the catalog names.
-    pub tiles: u64,
-    /// Their pyramids' size \[bytes\]; of quick checks, what the storage says.
-    pub bytes: u64,
-    /// Pyramids without checksums, which older versions wrote.
-    pub without_checksums: u64,
-    /// Replaced pyramids that wait for their deletion.
-    pub retired: u64,
-    /// Unnamed objects that are too young to be called orphans.
-    pub young: u64,
-    /// What is not as it should be.
-    pub findings: Vec<Finding>,
-}
-
-/// Something that is not as it should be.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Finding {
-    /// What it is.
-    pub kind: FindingKind,
-    /// The volume, if it belongs to one.
-    pub volume: Option<String>,
-    /// The tile, if it is one's.
-    pub tile: Option<String>,
-    /// The object in the storage.
-    pub object: Option<String>,
-    /// What is wrong.
-    pub reason: String,
-    /// What was done about it.
-    pub repair: Option<Repair>,
-}
-
-impl Finding {
-    /// Whether it is mended, or will be.
-    fn is_mended(&self) -> bool {
-        matches!(
-            self.repair,
-            Some(Repair::Queued | Repair::Recounted | Repair::Moved)
-        )
-    }
-}
-
-/// What can be wrong.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "kebab-case")]
-#[non_exhaustive]
-pub enum FindingKind {
-    /// The catalog names a pyramid that is not there.
-    Missing,
-    /// A pyramid is not what was written.
-    Damaged,
-    /// A pyramid is whole, but that of another tile.
-    Mistaken,
-    /// A tile lies where nothing can: numbers that are none, or outside the volume.
-    Misplaced,
-    /// Two tiles name one pyramid.
-    Shared,
-    /// What the catalog says of a tile or of a volume cannot be understood.
-    Spoilt,
-    /// The catalog's counts are not those of its tiles.
-    Miscounted,
-    /// A pyramid that nothing names. Harmless, but it takes space.
-    Orphan,
-}
-
-/// What was done about a finding.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-#[non_exhaustive]
-pub enum Repair {
-    /// The object is deleted.
-    Deleted,
-    /// The tile's record waits for ingest, which makes the pyramid anew.
-    Queued,
-    /// The tiles were counted anew.
-    Recounted,
-    /// The tile lies where its records say.
-    Moved,
-    /// The tile is in quarantine, for its record or image is not to be had.
-    Quarantined,
-}
-
-impl FindingKind {
-    /// Whether something is lost; else only space is.
-    pub fn is_damage(self) -> bool {
-        self != Self::Orphan
-    }
-}
-
-impl CheckReport {
-    /// Findings that are damage and not on the way to be mended.
-    pub fn damage(&self) -> usize {
-        let damage = self
-            .findings
-            .iter()
-            .filter(|finding| finding.kind.is_damage() && !finding.is_mended());
-        damage.count()
-    }
-}
-
 /// Why an archive could not be checked to its end.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -184,6 +88,9 @@ pub enum CheckError {
 /// moved to where its records say, and of tiles that name one pyramid, those of whose records it was not made are given back to
 /// ingest.
 ///
+/// Where the records are at hand, the catalog is held against them: a tile that it lacks, or of which it says something else
+/// than the record, is found, and given back to ingest if that is wanted.
+///
 /// # Errors
 ///
 /// [`CheckError`]: of what made going on pointless, not of a single object.
@@ -209,6 +116,14 @@ pub async fn check(
         shared: HashSet::new(),
         given_back: HashSet::new(),
         unknown: HashSet::new(),
+        known: volumes.iter().map(|volume| volume.name.clone()).collect(),
+        read: None,
+        records: None,
+        compared: HashSet::new(),
+        kept: HashSet::new(),
+        miscounted: Vec::new(),
+        lacking: HashSet::new(),
+        doubtful: HashSet::new(),
     };
     for volume in volumes {
         match volume.entry {
@@ -217,6 +132,7 @@ pub async fn check(
         }
     }
     check.orphans(&objects).await?;
+    check.recount().await?;
     let mut report = check.report;
     if options.quick {
         let sizes = objects.iter().map(|object| object.size);
@@ -240,6 +156,22 @@ struct Check<'a> {
     given_back: HashSet<(String, String)>,
     /// Volumes of whose tiles nothing is known.
     unknown: HashSet<String>,
+    /// Volumes that the catalog names.
+    known: HashSet<String>,
+    /// How far the records of the volume at hand were read, if that can be understood.
+    read: Option<Cursor>,
+    /// What they say, if they are at hand.
+    records: Option<records::Records>,
+    /// Volumes that were held against their records.
+    compared: HashSet<String>,
+    /// Volumes and positions of records of tiles whose rows do not name the pyramid that may be theirs.
+    kept: HashSet<(String, u64)>,
+    /// Volumes whose tiles are counted wrongly, and the findings that say so.
+    miscounted: Vec<(String, usize)>,
+    /// Those of them that have fewer than are counted, with nothing that says which.
+    lacking: HashSet<String>,
+    /// Those of them with objects that may be of tiles that were lost.
+    doubtful: HashSet<String>,
 }
 
 impl Check<'_> {
@@ -247,6 +179,8 @@ impl Check<'_> {
         let catalog = self.archive.catalog();
         let volume = &entry.volume;
         let before = self.report.tiles;
+        self.read_up_to(entry).await?;
+        self.read_records(entry).await?;
         // Not those that are counted: what the counts leave out would be called nobody's.
         let sections = catalog.sections_of_tiles(&volume.name).await?;
         for &z in &sections {
@@ -269,34 +203,82 @@ impl Check<'_> {
             }
             (self.progress)(self.report.tiles, self.total);
         }
+        for spoilt in catalog.rows_without_section(&volume.name).await? {
+            self.report.tiles += 1;
+            self.spoilt(entry, spoilt).await?;
+        }
+        self.lost(entry).await?;
+        self.spoilt_waiting(entry).await?;
         let tiles = self.report.tiles - before;
         // Others may have entered some meanwhile: only what cannot be so is wrong.
         let now = catalog.entry(&volume.name).await?;
         let counted = catalog.sections(&volume.name).await?;
         let still = catalog.sections_of_tiles(&volume.name).await?;
-        let lacks = |z: &&u32| still.binary_search(z).is_ok() && counted.binary_search(z).is_err();
-        let lacks = sections.iter().filter(lacks).count();
+        let is_lacking =
+            |z: &&u32| still.binary_search(z).is_ok() && counted.binary_search(z).is_err();
+        // Those that the volume does not have are told with their tiles.
+        let depth = entry.volume.extent().z;
+        let lacks = sections.iter().filter(|z| **z < depth);
+        let lacks = lacks.filter(is_lacking).count();
         let all = (entry.tiles.min(now.tiles)..=entry.tiles.max(now.tiles)).contains(&tiles);
         if !all || lacks > 0 {
-            let reason = format!(
+            let mut reason = format!(
                 "the catalog counts {} tiles, but has {tiles}; of {} sections with tiles it lacks {lacks}",
                 now.tiles,
                 sections.len()
             );
-            let repair = match self.options.repair {
-                true => {
-                    catalog.recount(&volume.name).await?;
-                    Some(Repair::Recounted)
-                }
-                false => None,
-            };
-            let found = self.find(FindingKind::Miscounted, entry, None, reason);
-            found.repair = repair;
+            if tiles < now.tiles && !self.compared.contains(&volume.name) {
+                self.lacking.insert(volume.name.clone());
+                reason.push_str("; where tiles are lost, --acquisition FOLDER tells which");
+            }
+            let number = self.report.findings.len();
+            self.find(FindingKind::Miscounted, entry, None, reason);
+            self.miscounted.push((volume.name.clone(), number));
         }
         let later = SystemTime::now() + Duration::from_secs(1 << 32);
         for retired in catalog.retired(&volume.name, later, u32::MAX).await? {
             self.report.retired += 1;
-            self.named.insert(self.hasher.hash_one(&retired.pyramid));
+            if !self.named.insert(self.hasher.hash_one(&retired.pyramid)) {
+                self.living(entry, &retired.pyramid).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// A pyramid is on the list of those that are to be deleted; somebody may have taken it there since its tile was looked at.
+    async fn living(&mut self, entry: &VolumeEntry, pyramid: &str) -> Result<(), CheckError> {
+        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
+        let origins = catalog.origins(volume, pyramid).await?;
+        let Some(origin) = origins.into_iter().next() else {
+            return Ok(());
+        };
+        let mut repair = None;
+        if self.options.repair {
+            let mut commit = catalog.begin(volume).await?;
+            commit.forget_retired(pyramid).await?;
+            commit.finish().await?;
+            repair = Some(Repair::Kept);
+        }
+        let reason =
+            "the catalog says that nothing names its pyramid, and that it is to be deleted";
+        self.report.findings.push(Finding {
+            kind: FindingKind::Spoilt,
+            volume: Some(volume.clone()),
+            tile: Some(origin.tile),
+            object: Some(pyramid.to_owned()),
+            reason: reason.to_owned(),
+            repair,
+        });
+        Ok(())
+    }
+
+    /// Counts anew what is counted wrongly, where that is no sign of something that is lost.
+    async fn recount(&mut self) -> Result<(), CheckError> {
+        for (volume, number) in std::mem::take(&mut self.miscounted) {
+            if self.options.repair && !self.doubtful.contains(&volume) {
+                self.archive.catalog().recount(&volume).await?;
+                self.report.findings[number].repair = Some(Repair::Recounted);
+            }
         }
         Ok(())
     }
@@ -333,6 +315,10 @@ impl Check<'_> {
         let known = (entry.volume.name.clone(), tile.name.clone());
         if self.given_back.contains(&known) {
             return Ok(());
+        }
+        if let Some(reason) = self.contradicted(entry, tile) {
+            self.named.insert(self.hasher.hash_one(&tile.pyramid));
+            return self.mend(FindingKind::Spoilt, entry, tile, reason).await;
         }
         let extent = entry.volume.extent();
         if place(extent, tile.section, tile.size, tile.transform).is_none() {
@@ -401,7 +387,7 @@ impl Check<'_> {
         reason: String,
     ) -> Result<(), CheckError> {
         let repair = if self.options.repair {
-            Some(self.repair(entry, tile, &reason).await?)
+            Some(self.repair(entry, tile, kind, &reason).await?)
         } else {
             None
         };
@@ -425,254 +411,4 @@ impl Check<'_> {
             repair: None,
         })
     }
-
-    /// A tile names a pyramid that one before it names, too. It was made of one record: the tiles of others are found.
-    async fn shared(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<(), CheckError> {
-        if !self.shared.insert(tile.pyramid.clone()) {
-            return Ok(());
-        }
-        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let origins = catalog.origins(volume, &tile.pyramid).await?;
-        let made_of = position_of(&tile.pyramid);
-        let owner = |origin: &&Origin| Some(origin.position) == made_of;
-        let mut owners = origins.iter().filter(owner);
-        let owner = owners.next().filter(|_| owners.next().is_none());
-        // All of them at once. Where only one is left, somebody has mended it since it was listed.
-        let others = origins.iter().filter(|origin| owner != Some(*origin));
-        for origin in others.filter(|_| origins.len() > 1) {
-            let reason = match owner {
-                Some(owner) => format!("it names the pyramid of tile {}", owner.tile),
-                None => "it names a pyramid that others name, too, and that is nobody's".to_owned(),
-            };
-            let mut repair = None;
-            if self.options.repair {
-                repair = Some(self.give_back(entry, origin, &reason).await?);
-                let given_back = (volume.clone(), origin.tile.clone());
-                self.given_back.insert(given_back);
-            }
-            self.report.findings.push(Finding {
-                kind: FindingKind::Shared,
-                volume: Some(volume.clone()),
-                tile: Some(origin.tile.clone()),
-                object: Some(tile.pyramid.clone()),
-                reason,
-                repair,
-            });
-        }
-        Ok(())
-    }
-
-    /// Takes a pyramid that is not its own from a tile, and has it made anew.
-    async fn give_back(
-        &self,
-        entry: &VolumeEntry,
-        origin: &Origin,
-        reason: &str,
-    ) -> Result<Repair, CheckError> {
-        let catalog = self.archive.catalog();
-        let read = catalog.cursor(&entry.volume.name).await?;
-        let record = self.tile_record(entry, &origin.tile, origin.position, read);
-        let mut commit = catalog.begin(&entry.volume.name).await?;
-        commit.detach(&origin.tile).await?;
-        let repair = match record {
-            Some(record) => {
-                let waiting = Waiting {
-                    position: origin.position,
-                    record,
-                    reason: reason.to_owned(),
-                };
-                commit.wait(&waiting).await?;
-                Repair::Queued
-            }
-            None => {
-                let what = Quarantined {
-                    file: RecordReader::FILE.to_owned(),
-                    tile: Some(origin.tile.clone()),
-                    reason: format!(
-                        "{reason}; append the tile's record to its acquisition once more, and ingest makes its own"
-                    ),
-                    bytes: Some(0),
-                    at: SystemTime::now(),
-                };
-                commit.quarantine(&what).await?;
-                Repair::Quarantined
-            }
-        };
-        commit.finish().await?;
-        Ok(repair)
-    }
-
-    /// Gives a tile back to ingest, or puts it into quarantine.
-    async fn repair(
-        &self,
-        entry: &VolumeEntry,
-        tile: &Tile,
-        reason: &str,
-    ) -> Result<Repair, CheckError> {
-        let read = self.archive.catalog().cursor(&entry.volume.name).await?;
-        let position = match position_of(&tile.pyramid) {
-            // One that had another's, and was given back.
-            None => {
-                let catalog = self.archive.catalog();
-                let origins = catalog.origins(&entry.volume.name, &tile.pyramid).await?;
-                let own = origins.iter().find(|origin| origin.tile == tile.name);
-                own.map(|origin| origin.position)
-            }
-            position => position,
-        };
-        let record = position.and_then(|at| self.tile_record(entry, &tile.name, at, read));
-        let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
-        let repair = match position.zip(record) {
-            Some((position, record)) => {
-                let reason = format!("its pyramid was found damaged: {reason}");
-                let waiting = Waiting {
-                    position,
-                    record,
-                    reason,
-                };
-                commit.wait(&waiting).await?;
-                Repair::Queued
-            }
-            None => {
-                let what = Quarantined {
-                    file: tile.pyramid.clone(),
-                    tile: Some(tile.name.clone()),
-                    reason: format!(
-                        "the pyramid was found damaged ({reason}); append the tile's record to its \
-                         acquisition once more, and ingest makes it anew"
-                    ),
-                    bytes: None,
-                    at: SystemTime::now(),
-                };
-                commit.quarantine(&what).await?;
-                Repair::Quarantined
-            }
-        };
-        commit.finish().await?;
-        Ok(repair)
-    }
-
-    /// The record at a position, and the folder of its acquisition, if the records are those that were `read`.
-    fn record_at(&self, entry: &VolumeEntry, at: u64, read: Cursor) -> Option<(PathBuf, Record)> {
-        let kept = { self.options.watched.iter() }.map(|all| all.join(&entry.volume.name));
-        let mut kept = kept.filter(|folder| folder.join(RecordReader::FILE).is_file());
-        let folder = kept.next().or_else(|| self.options.acquisition.clone())?;
-        RecordReader::new(&folder, read).recognize().ok()?;
-        let cursor = Cursor {
-            offset: at,
-            ..Cursor::default()
-        };
-        let mut reader = RecordReader::new(&folder, cursor);
-        let line = reader.read(1).ok()?.into_iter().next()?;
-        let record = line.record.ok().filter(|_| line.offset == at)?;
-        Some((folder, record))
-    }
-
-    /// A tile's record at a position, if its image is still there.
-    fn tile_record(
-        &self,
-        entry: &VolumeEntry,
-        tile: &str,
-        at: u64,
-        read: Cursor,
-    ) -> Option<TileRecord> {
-        match self.record_at(entry, at, read)? {
-            (folder, Record::Tile(record)) if record.tile == tile => {
-                let image = image_path(&folder, &record.file)?;
-                image.is_file().then_some(record)
-            }
-            _ => None,
-        }
-    }
-
-    /// Finds what nothing names.
-    async fn orphans(&mut self, objects: &[Entry]) -> Result<(), CheckError> {
-        let now = SystemTime::now();
-        for object in objects {
-            let is_unknown = volume_of(&object.name).is_some_and(|v| self.unknown.contains(v));
-            if is_unknown || self.named.contains(&self.hasher.hash_one(&object.name)) {
-                continue;
-            }
-            let age = object.modified.and_then(|at| now.duration_since(at).ok());
-            if age.is_none_or(|age| age < self.options.safe_age) {
-                self.report.young += 1;
-                continue;
-            }
-            let origin = self.whence(&object.name).await?;
-            let repair = if self.options.repair && origin == Whence::Read {
-                self.archive.storage().delete(&object.name).await?;
-                Some(Repair::Deleted)
-            } else {
-                None
-            };
-            let why = match origin {
-                Whence::Read => "",
-                Whence::Later => {
-                    ", which are of a record that the catalog has not read: if it is an older copy, `saccade ingest` goes on \
-                     from there; they are never deleted"
-                }
-                Whence::Foreign => {
-                    ", and they are no pyramid of this catalog's; they are never deleted"
-                }
-            };
-            self.report.findings.push(Finding {
-                kind: FindingKind::Orphan,
-                volume: None,
-                tile: None,
-                object: Some(object.name.clone()),
-                reason: format!("nothing names these {} bytes{why}", object.size),
-                repair,
-            });
-        }
-        Ok(())
-    }
-}
-
-/// Where an object comes from that nothing names.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Whence {
-    /// A record that the catalog has read: what came of it is entered, or will never be.
-    Read,
-    /// One that it has not read.
-    Later,
-    /// None of this catalog's volumes.
-    Foreign,
-}
-
-impl Check<'_> {
-    async fn whence(&self, object: &str) -> Result<Whence, CheckError> {
-        let parts: Vec<&str> = object.split('/').collect();
-        let ["tiles", volume, section, pyramid] = parts[..] else {
-            return Ok(Whence::Foreign);
-        };
-        let (Some(position), Ok(_)) = (position_of(pyramid), section.parse::<u32>()) else {
-            return Ok(Whence::Foreign);
-        };
-        match self.archive.catalog().cursor(volume).await {
-            Ok(read) if position < read.offset => Ok(Whence::Read),
-            Ok(_) => Ok(Whence::Later),
-            Err(CatalogError::UnknownVolume { .. }) => Ok(Whence::Foreign),
-            Err(error) => Err(error.into()),
-        }
-    }
-}
-
-/// The volume whose tile's a pyramid is.
-fn volume_of(pyramid: &str) -> Option<&str> {
-    Some(pyramid.strip_prefix("tiles/")?.split_once('/')?.0)
-}
-
-/// The position of the record that a pyramid was made of: ingest ends names with it.
-fn position_of(pyramid: &str) -> Option<u64> {
-    let stem = pyramid.strip_suffix(".tif")?;
-    u64::from_str_radix(stem.rsplit_once('-')?.1, 16).ok()
-}
-
-/// How many findings there are of each kind.
-pub fn count(findings: &[Finding]) -> BTreeMap<FindingKind, usize> {
-    let mut counts = BTreeMap::new();
-    for finding in findings {
-        *counts.entry(finding.kind).or_default() += 1;
-    }
-    counts
 }

@@ -261,13 +261,16 @@ pub async fn apply(
             break;
         }
         let name = line.change.tile();
-        let tile = catalog.tile(volume, name).await;
+        let (known, now) = match catalog.tile(volume, name).await {
+            Ok(tile) => (tile.is_some(), tile.map(|tile| tile.section)),
+            // It can be deleted, and moved if only where it lies is not understood.
+            Err(CatalogError::SpoiltTile { .. }) => (true, None),
+            Err(e) => return Err(failed(e, done)),
+        };
         // A line before may be about to delete it.
-        let tile = tile.map_err(|e| failed(e, done))?;
-        let now = tile
-            .filter(|_| !gone.contains(name))
-            .map(|tile| tile.section);
-        if matches!(line.change, Change::Delete(_)) && now.is_some() {
+        let known = known && !gone.contains(name);
+        let now = now.filter(|_| known);
+        if matches!(line.change, Change::Delete(_)) && known {
             gone.insert(name);
         }
         // Lines about nothing belong to whatever is around them.
@@ -279,7 +282,7 @@ pub async fn apply(
             group.clear();
         }
         section = now.or(section);
-        group.push((line, now.is_some()));
+        group.push((line, known));
     }
     if !group.is_empty() && !cancel.is_cancelled() {
         let applied = transaction(catalog, volume, &group, position).await;
@@ -296,6 +299,7 @@ enum Outcome {
     Unchanged,
     Deleted,
     Unknown,
+    Kept,
     Refused(String),
 }
 
@@ -315,8 +319,7 @@ async fn transaction(
                 match commit.transform(tile, record.transform, None).await {
                     Ok(TransformOutcome::Moved) => Outcome::Moved,
                     Ok(TransformOutcome::Unchanged) => Outcome::Unchanged,
-                    // Another process deleted it just now.
-                    Ok(TransformOutcome::Kept) => Outcome::Unknown,
+                    Ok(TransformOutcome::Kept) => Outcome::Kept,
                     Err(outside @ CatalogError::OutsideVolume { .. }) => {
                         Outcome::Refused(outside.to_string())
                     }
@@ -335,6 +338,14 @@ async fn transaction(
             Outcome::Unknown => {
                 summary.unknown += 1;
                 summary.note(format!("line {line}: the volume has no tile {tile:?}"));
+            }
+            // Or another process deleted it just now.
+            Outcome::Kept => {
+                summary.unknown += 1;
+                summary.note(format!(
+                    "line {line}: the size of tile {tile:?} is not known any more; append its record once more, and it \
+                     lies there"
+                ));
             }
             Outcome::Refused(why) => {
                 summary.refused += 1;

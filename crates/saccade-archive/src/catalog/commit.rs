@@ -1,5 +1,7 @@
 //! One transaction: everything in it happens, or nothing.
 
+mod remembered;
+
 use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
 use std::time::SystemTime;
@@ -9,11 +11,8 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::voxel_box::VoxelBox;
 
 use super::database::{Durability, Row, Statement, Transaction, Value};
-use super::{
-    Catalog, CatalogError, ChangeReason, NewTile, Quarantined, TileId, Waiting, Worker, place,
-    postgres, rows,
-};
-use crate::acquisition::{Cursor, RecordReader};
+use super::tiles::RECOUNT;
+use super::{Catalog, CatalogError, ChangeReason, NewTile, TileId, place, postgres, rows};
 
 /// What became of a tile.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -62,21 +61,33 @@ pub struct Commit<'c> {
     revision: u64,
     /// Tiles that sections gain and lose.
     sections: BTreeMap<u32, i64>,
+    /// Tiles that the volume gains.
+    tiles: i64,
+    /// Whether tiles left sections that cannot be, so that nobody knows where they were counted.
+    uncounted: bool,
 }
 
-/// What a commit needs to know of a tile that is there.
+/// What a commit needs to know of a tile that is there. What the catalog says may be what cannot be: whatever comes next
+/// for the tile mends that.
 struct Existing {
     id: TileId,
     deleted: bool,
-    section: u32,
-    /// `None` if it is outside, deleted, or nowhere.
+    section: Option<u32>,
+    /// `None` if it is outside, deleted, or nowhere; all of its section if it cannot be told.
     place: Option<VoxelBox>,
-    /// `None` if what the catalog says is none: the next record that says where it lies mends that.
     transform: Option<SectionFromTile>,
-    size: glam::UVec2,
-    pyramid: String,
+    size: Option<glam::UVec2>,
+    pyramid: Option<String>,
+    /// 0 where it cannot be: any record is newer.
     position: u64,
     transform_position: u64,
+}
+
+impl Existing {
+    /// Its section and size, without which it cannot be moved.
+    fn shape(&self) -> Option<(u32, glam::UVec2)> {
+        self.section.zip(self.size)
+    }
 }
 
 impl<'c> Commit<'c> {
@@ -103,6 +114,8 @@ impl<'c> Commit<'c> {
             before: entry.revision,
             revision: entry.revision,
             sections: BTreeMap::new(),
+            tiles: 0,
+            uncounted: false,
         })
     }
 
@@ -130,28 +143,29 @@ impl<'c> Commit<'c> {
             None => (None, None),
         };
         let existing = existing.filter(|e| !e.deleted);
-        let early = if existing.is_none() {
+        let early = if existing.as_ref().is_none_or(|e| e.shape().is_none()) {
             self.early(tile, deleted).await?
         } else {
             None
         };
-        // The newest record says where the tile lies.
+        // The newest record says where the tile lies, if any of it is inside then.
         let newer = { existing.as_ref() }.filter(|e| e.transform_position > tile.position);
         let newer = newer.and_then(|e| Some((e.transform?, e.transform_position)));
-        let (transform, transform_position) = match (newer, early) {
-            (Some(newer), _) => newer,
-            (None, Some((transform, position))) => (transform, position.max(tile.position)),
-            (None, None) => (tile.transform, tile.position),
-        };
+        let inside = |at: &_| place(self.extent, tile.section, tile.size, *at).is_some();
+        let newer = newer.filter(|(at, _)| inside(at));
+        let early = early.map(|(at, position)| (at, position.max(tile.position)));
+        let newest = newer.into_iter().chain(early).max_by_key(|said| said.1);
+        let (transform, transform_position) = newest.unwrap_or((tile.transform, tile.position));
         let place = self.place(&tile.name, tile.section, tile.size, transform)?;
         let id = match known {
             Some(id) => id,
             None => self.insert_name(&tile.name).await?,
         };
         if let Some(existing) = &existing {
-            *self.sections.entry(existing.section).or_default() -= 1;
+            self.leaves(existing);
         }
         *self.sections.entry(tile.section).or_default() += 1;
+        self.tiles += 1;
         let old = existing.as_ref().and_then(|e| e.place);
         self.log_change(id, old, Some(place), ChangeReason::Tile)
             .await?;
@@ -173,13 +187,23 @@ impl<'c> Commit<'c> {
         values.extend(transform.elements().map(Value::from));
         self.run(update, &values).await?;
         self.end_quarantine(&tile.name).await?;
+        self.forget_retired(&tile.pyramid).await?;
         let Some(existing) = existing else {
             return Ok(TileOutcome::New);
         };
-        if existing.pyramid != tile.pyramid {
-            self.retire(&existing.pyramid, now).await?;
+        if let Some(pyramid) = existing.pyramid.filter(|p| *p != tile.pyramid) {
+            self.retire(&pyramid, now).await?;
         }
         Ok(TileOutcome::Replaced)
+    }
+
+    /// A tile is no more where it was.
+    fn leaves(&mut self, tile: &Existing) {
+        self.tiles -= 1;
+        match tile.section {
+            Some(section) => *self.sections.entry(section).or_default() -= 1,
+            None => self.uncounted = true,
+        }
     }
 
     /// Moves a tile, or keeps the transform until the tile comes.
@@ -202,7 +226,9 @@ impl<'c> Commit<'c> {
         if existing.as_ref().is_some_and(|e| e.deleted && older(e)) {
             return Ok(TransformOutcome::Unchanged);
         }
-        let Some(existing) = existing.filter(|e| !e.deleted) else {
+        let existing = existing.filter(|e| !e.deleted);
+        let Some((existing, (section, size))) = existing.and_then(|e| e.shape().map(|s| (e, s)))
+        else {
             self.keep_early(tile, transform, position.unwrap_or(0))
                 .await?;
             return Ok(TransformOutcome::Kept);
@@ -211,7 +237,7 @@ impl<'c> Commit<'c> {
         if existing.transform_position > position {
             return Ok(TransformOutcome::Unchanged);
         }
-        let place = self.place(tile, existing.section, existing.size, transform)?;
+        let place = self.place(tile, section, size, transform)?;
         self.end_misplacement(tile).await?;
         let moved = existing.transform != Some(transform);
         if moved {
@@ -247,10 +273,22 @@ impl<'c> Commit<'c> {
         self.log_change(id, place, place, ChangeReason::Tile)
             .await?;
         // No record's, for those end with a position; and no other tile's.
-        let none = format!("{}-none{}", existing.pyramid, id.0);
+        let none = format!("{}-none{}", existing.pyramid.unwrap_or_default(), id.0);
         let update = "UPDATE tiles SET pyramid = $2, revision = $3 WHERE id = $1";
         let values = [id.0.into(), (&none).into(), self.revision.into()];
         self.run(update, &values).await?;
+        Ok(())
+    }
+
+    /// Ends a row whose tile has no name by which a record could speak of it.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn end_nameless(&mut self, id: TileId) -> Result<(), CatalogError> {
+        let end = "UPDATE tiles SET deleted = 1, pyramid = '' WHERE volume = $1 AND id = $2";
+        self.run(end, &[self.volume.into(), id.0.into()]).await?;
+        self.uncounted = true;
         Ok(())
     }
 
@@ -281,8 +319,10 @@ impl<'c> Commit<'c> {
             Some(e) => {
                 self.log_change(e.id, e.place, None, ChangeReason::Deleted)
                     .await?;
-                *self.sections.entry(e.section).or_default() -= 1;
-                self.retire(&e.pyramid, now).await?;
+                self.leaves(&e);
+                if let Some(pyramid) = &e.pyramid {
+                    self.retire(pyramid, now).await?;
+                }
                 if let Some(transform) = e.transform
                     && e.transform_position > position
                 {
@@ -299,176 +339,6 @@ impl<'c> Commit<'c> {
         Ok(outcome)
     }
 
-    async fn end_quarantine(&mut self, tile: &str) -> Result<(), CatalogError> {
-        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2";
-        self.run(end, &[self.volume.into(), tile.into()]).await?;
-        Ok(())
-    }
-
-    /// A record that says where a tile lies ends what was set aside of earlier ones that could not be followed: entries
-    /// of the records themselves, without a size. Those of images, and of lines that are no records, stay.
-    async fn end_misplacement(&mut self, tile: &str) -> Result<(), CatalogError> {
-        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2 AND file = $3 AND bytes IS NULL";
-        let values = [self.volume.into(), tile.into(), RecordReader::FILE.into()];
-        self.run(end, &values).await?;
-        Ok(())
-    }
-
-    async fn retire(&mut self, pyramid: &str, now: SystemTime) -> Result<(), CatalogError> {
-        let retire = "INSERT INTO retired (pyramid, volume, at) VALUES ($1, $2, $3) \
-                      ON CONFLICT (pyramid) DO UPDATE SET volume = excluded.volume, at = excluded.at";
-        let values = [pyramid.into(), self.volume.into(), rows::millis(now).into()];
-        self.run(retire, &values).await?;
-        Ok(())
-    }
-
-    /// Notes a file or record that could not become a tile.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn quarantine(&mut self, what: &Quarantined) -> Result<(), CatalogError> {
-        let insert = "INSERT INTO quarantine (volume, file, tile, reason, bytes, at) \
-                      VALUES ($1, $2, $3, $4, $5, $6)";
-        let bytes = what.bytes.map(|b| i64::try_from(b).unwrap_or(i64::MAX));
-        let values = [
-            self.volume.into(),
-            (&what.file).into(),
-            Value::MaybeText(what.tile.as_deref()),
-            (&what.reason).into(),
-            Value::MaybeInteger(bytes),
-            rows::millis(what.at).into(),
-        ];
-        self.run(insert, &values).await?;
-        Ok(())
-    }
-
-    /// Remembers how far the records were read.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn cursor(&mut self, cursor: Cursor) -> Result<(), CatalogError> {
-        let insert = "INSERT INTO cursors (volume, byte, line, seen) VALUES ($1, $2, $3, $4) \
-                      ON CONFLICT (volume) DO UPDATE SET \
-                      byte = excluded.byte, line = excluded.line, seen = excluded.seen";
-        let values = [
-            self.volume.into(),
-            cursor.offset.into(),
-            cursor.line.into(),
-            Value::MaybeInteger(cursor.seen.map(u64::cast_signed)),
-        ];
-        self.run(insert, &values).await?;
-        Ok(())
-    }
-
-    /// Remembers that the records from one cursor to another were read, unless another worker did
-    /// so: then it is `false`, and nothing changed.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn advance(&mut self, from: Cursor, to: Cursor) -> Result<bool, CatalogError> {
-        let question = "SELECT byte, line, seen FROM cursors WHERE volume = $1";
-        let row = self.one(question, &[self.volume.into()]).await?;
-        let now = row.as_ref().map(rows::cursor).transpose();
-        let now = now.map_err(|e| self.catalog.failed(e))?;
-        if now.unwrap_or_default() != from {
-            return Ok(false);
-        }
-        self.cursor(to).await?;
-        Ok(true)
-    }
-
-    /// Puts a record in the queue, for a worker to claim.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn enqueue(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
-        self.keep(waiting, 0).await
-    }
-
-    /// Remembers a record whose file is not whole yet. Whoever has claimed it keeps it.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn wait(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
-        self.keep(waiting, 1).await
-    }
-
-    async fn keep(&mut self, waiting: &Waiting, parked: u32) -> Result<(), CatalogError> {
-        let record = serde_json::to_string(&waiting.record).expect("a record becomes JSON");
-        let keep = "INSERT INTO waiting (volume, position, tile, record, reason, parked) \
-                    VALUES ($1, $2, $3, $4, $5, $6) ON CONFLICT (volume, position) DO UPDATE SET \
-                    tile = excluded.tile, record = excluded.record, reason = excluded.reason, \
-                    parked = excluded.parked, attempts = 0, begun = 0";
-        let values = [
-            self.volume.into(),
-            waiting.position.into(),
-            (&waiting.record.tile).into(),
-            (&record).into(),
-            (&waiting.reason).into(),
-            parked.into(),
-        ];
-        self.run(keep, &values).await?;
-        Ok(())
-    }
-
-    /// Whether a record of that tile is still to be worked on; one whose file is not whole does not count.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn is_queued(&mut self, tile: &str) -> Result<bool, CatalogError> {
-        let question = "SELECT position FROM waiting \
-                        WHERE volume = $1 AND tile = $2 AND parked = 0 LIMIT 1";
-        let values = [self.volume.into(), tile.into()];
-        Ok(self.one(question, &values).await?.is_some())
-    }
-
-    /// Whether a claimed record is still the worker's: if its lease was over for a while, another may
-    /// have it, or be done with it. What it became is then another's to say.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn holds(&mut self, worker: &Worker, position: u64) -> Result<bool, CatalogError> {
-        let question = Statement {
-            sqlite: "SELECT worker FROM waiting \
-                     WHERE volume = $1 AND position = $2 AND worker = $3",
-            // Until this transaction ends, nobody claims it.
-            postgres: "SELECT worker FROM waiting \
-                       WHERE volume = $1 AND position = $2 AND worker = $3 FOR UPDATE",
-        };
-        let values = [self.volume.into(), position.into(), worker.id.into()];
-        Ok(self.one(question, &values).await?.is_some())
-    }
-
-    /// Forgets a record that waited. It is no error if there is none.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn wait_no_more(&mut self, position: u64) -> Result<(), CatalogError> {
-        let forget = "DELETE FROM waiting WHERE volume = $1 AND position = $2";
-        self.run(forget, &[self.volume.into(), position.into()])
-            .await?;
-        Ok(())
-    }
-
-    /// Forgets a retired pyramid, once it is deleted.
-    ///
-    /// # Errors
-    ///
-    /// What the database says.
-    pub async fn forget_retired(&mut self, pyramid: &str) -> Result<(), CatalogError> {
-        self.run("DELETE FROM retired WHERE pyramid = $1", &[pyramid.into()])
-            .await?;
-        Ok(())
-    }
-
     /// Makes it so: when this returns, it survives a power cut. Returns the volume's revision.
     ///
     /// # Errors
@@ -478,12 +348,18 @@ impl<'c> Commit<'c> {
     pub async fn finish(mut self) -> Result<u64, CatalogError> {
         self.count_sections().await?;
         let changed = self.revision != self.before;
+        if changed || self.tiles != 0 {
+            let update = "UPDATE volumes SET revision = $2, tiles = tiles + $3 WHERE id = $1";
+            let values = [self.volume.into(), self.revision.into(), self.tiles.into()];
+            self.run(update, &values).await?;
+        }
+        if self.uncounted {
+            for count in RECOUNT {
+                self.run(count, &[self.volume.into()]).await?;
+            }
+        }
         if changed {
             self.forget_changes().await?;
-            let update = "UPDATE volumes SET revision = $2, tiles = tiles + $3 WHERE id = $1";
-            let more: i64 = self.sections.values().sum();
-            let values = [self.volume.into(), self.revision.into(), more.into()];
-            self.run(update, &values).await?;
             if let Transaction::Postgres(_) = &self.transaction {
                 let told = format!("{} {}", self.revision, self.name);
                 let tell = "SELECT pg_notify($1, $2)";
@@ -531,8 +407,10 @@ impl<'c> Commit<'c> {
             let values = [self.volume.into(), (*section).into(), (*more).into()];
             self.run(count, &values).await?;
             if *more < 0 {
-                let forget = "DELETE FROM sections \
-                              WHERE volume = $1 AND section = $2 AND tiles = 0";
+                // Whatever was counted: somebody may have moved tiles from one section to another.
+                let forget = "DELETE FROM sections WHERE volume = $1 AND section = $2 \
+                              AND NOT EXISTS (SELECT 1 FROM tiles t WHERE t.volume = $1 \
+                              AND t.section = $2 AND t.deleted = 0)";
                 self.run(forget, &[self.volume.into(), (*section).into()])
                     .await?;
             }
@@ -586,19 +464,25 @@ impl<'c> Commit<'c> {
         let extent = self.extent;
         let decode = || {
             let deleted = row.get::<i64>("deleted")? != 0;
-            let (section, size) = (rows::section(&row)?, rows::size(&row)?);
+            let (section, size) = (rows::section(&row).ok(), rows::size(&row).ok());
             let transform = rows::transform(&row).ok();
-            let at = transform.filter(|_| !deleted);
+            // Where nobody knows how much it is, its section could not be read, and can be from now on.
+            let (size_or_all, at) = match size.zip(transform) {
+                Some(known) => known,
+                None => (extent.truncate(), SectionFromTile::IDENTITY),
+            };
+            let section_if_there = section.filter(|_| !deleted);
+            let place = section_if_there.and_then(|z| place(extent, z, size_or_all, at));
             Ok(Existing {
                 id: TileId(row.get("id")?),
                 deleted,
                 section,
-                place: at.and_then(|at| place(extent, section, size, at)),
+                place,
                 transform,
                 size,
-                pyramid: row.get("pyramid")?,
-                position: rows::unsigned(&row, "position")?,
-                transform_position: rows::unsigned(&row, "transform_position")?,
+                pyramid: rows::pyramid(&row).ok(),
+                position: rows::unsigned(&row, "position").unwrap_or(0),
+                transform_position: rows::unsigned(&row, "transform_position").unwrap_or(0),
             })
         };
         decode().map(Some).map_err(|e| self.catalog.failed(e))
@@ -646,60 +530,5 @@ impl<'c> Commit<'c> {
             self.run(log, &values).await?;
         }
         Ok(())
-    }
-
-    async fn keep_early(
-        &mut self,
-        tile: &str,
-        transform: SectionFromTile,
-        position: u64,
-    ) -> Result<(), CatalogError> {
-        let keep = "INSERT INTO early_transforms \
-                    (volume, tile, position, a, b, c, d, tx, ty) \
-                    VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9) \
-                    ON CONFLICT (volume, tile) DO UPDATE SET \
-                    a = excluded.a, b = excluded.b, c = excluded.c, d = excluded.d, \
-                    tx = excluded.tx, ty = excluded.ty, position = excluded.position \
-                    WHERE excluded.position >= early_transforms.position";
-        let mut values = vec![self.volume.into(), tile.into(), position.into()];
-        values.extend(transform.elements().map(Value::from));
-        self.run(keep, &values).await?;
-        Ok(())
-    }
-
-    /// Takes out the transform that came before a tile's first image, or the first since it was
-    /// `deleted`, if it still counts.
-    async fn early(
-        &mut self,
-        tile: &NewTile,
-        deleted: Option<u64>,
-    ) -> Result<Option<(SectionFromTile, u64)>, CatalogError> {
-        let take = "DELETE FROM early_transforms WHERE volume = $1 AND tile = $2 \
-                    RETURNING a, b, c, d, tx, ty, position, \
-                    (SELECT count(*) FROM waiting \
-                       WHERE waiting.volume = $1 AND waiting.tile = $2 \
-                         AND waiting.position < $3 AND waiting.position > $4) AS older_waiting";
-        let deleted = deleted.map_or(-1, |p| i64::try_from(p).unwrap_or(i64::MAX));
-        let values = [
-            self.volume.into(),
-            (&tile.name).into(),
-            tile.position.into(),
-            deleted.into(),
-        ];
-        let Some(row) = self.one(take, &values).await? else {
-            return Ok(None);
-        };
-        let decode = || {
-            Ok((
-                rows::transform(&row)?,
-                rows::unsigned(&row, "position")?,
-                row.get::<i64>("older_waiting")? > 0,
-            ))
-        };
-        let (transform, position, older_waits) = decode().map_err(|e| self.catalog.failed(e))?;
-        // It counts for the first image, which may still be waiting and then never comes.
-        let counts = position > tile.position || !older_waits;
-        let inside = place(self.extent, tile.section, tile.size, transform).is_some();
-        Ok((counts && inside).then_some((transform, position)))
     }
 }

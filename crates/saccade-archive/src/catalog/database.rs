@@ -102,6 +102,14 @@ impl Row {
             Self::Postgres(row) => row.try_get(column),
         }
     }
+
+    /// The bytes of a text, which need not be one: SQLite keeps what it is given.
+    pub(super) fn text(&self, column: &str) -> Result<Vec<u8>, Error> {
+        match self {
+            Self::Sqlite(row) => row.try_get_unchecked(column),
+            Self::Postgres(row) => row.try_get(column).map(String::into_bytes),
+        }
+    }
 }
 
 macro_rules! query {

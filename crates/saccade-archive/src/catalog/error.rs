@@ -179,12 +179,25 @@ pub enum CatalogError {
     /// The catalog's row of a tile means nothing.
     #[error(
         "what the catalog says of tile {tile:?} of volume {volume:?} cannot be understood ({reason}): `saccade check \
-         --repair` mends it from the acquisition's records: {location}"
+         --repair --acquisition FOLDER` mends it from the acquisition's records, and so does its record once more: {location}"
     )]
     SpoiltTile {
         /// The tile.
         tile: String,
         /// Its volume.
+        volume: String,
+        /// What is wrong.
+        reason: String,
+        /// Where it is.
+        location: CatalogLocation,
+    },
+    /// What the catalog says of how far a volume's records were read means nothing.
+    #[error(
+        "how far the records of volume {volume:?} were read cannot be understood ({reason}): `saccade check --repair \
+         --acquisition FOLDER` finds it out from the records: {location}"
+    )]
+    SpoiltCursor {
+        /// The volume.
         volume: String,
         /// What is wrong.
         reason: String,
@@ -365,6 +378,7 @@ impl CatalogError {
             | Self::Away { location, .. }
             | Self::SpoiltVolume { location, .. }
             | Self::SpoiltTile { location, .. }
+            | Self::SpoiltCursor { location, .. }
             | Self::Database { location, .. } => Some(location),
             Self::Missed { .. }
             | Self::UnknownVolume { .. }

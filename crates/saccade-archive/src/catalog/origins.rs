@@ -26,4 +26,28 @@ impl Catalog {
         let values = [id.into(), pyramid.into()];
         self.ask(question, &values, rows::origin).await
     }
+
+    /// Whether a tile names a pyramid, which is looked for where a pyramid of that name belongs: in its section, and with
+    /// the tile that it is called after. Cheap at any number of tiles; those of other names are looked for everywhere.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn is_named(&self, volume: &str, pyramid: &str) -> Result<bool, CatalogError> {
+        let parts: Vec<_> = pyramid.split('/').collect();
+        let section = match parts[..] {
+            ["tiles", _, section, _] => section.parse::<u32>().ok(),
+            _ => None,
+        };
+        let Some(section) = section else {
+            return Ok(!self.origins(volume, pyramid).await?.is_empty());
+        };
+        let stem = parts[3].rsplit_once('-').map_or(parts[3], |(stem, _)| stem);
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id FROM tiles WHERE volume = $1 AND (section = $2 OR name = $3) \
+                        AND pyramid = $4 AND deleted = 0 LIMIT 1";
+        let values = [id.into(), section.into(), stem.into(), pyramid.into()];
+        let named = self.ask(question, &values, |row| row.get::<i64>("id"));
+        Ok(!named.await?.is_empty())
+    }
 }

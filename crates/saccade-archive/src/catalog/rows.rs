@@ -4,7 +4,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use glam::{UVec2, UVec3};
 use saccade_core::transform::SectionFromTile;
-use saccade_core::volume::Volume;
+use saccade_core::volume::{MAX_EXTENT, Volume};
 use saccade_core::voxel_box::VoxelBox;
 use sqlx::Error;
 
@@ -14,6 +14,7 @@ use super::{
     Statistics, Tile, TileId, VolumeEntry, Waiting,
 };
 use crate::acquisition::Cursor;
+use crate::storage::check_name;
 
 pub(super) fn millis(time: SystemTime) -> i64 {
     let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -30,6 +31,21 @@ fn decode(column: &str, source: impl Into<Box<dyn std::error::Error + Send + Syn
 pub(super) fn unsigned(row: &Row, column: &str) -> Result<u64, Error> {
     let value: i64 = row.get(column)?;
     u64::try_from(value).map_err(|e| decode(column, e))
+}
+
+/// A text, and of one that is none what can be read of it.
+pub(super) fn legible(row: &Row, column: &str) -> String {
+    let bytes = row.text(column).unwrap_or_default();
+    String::from_utf8_lossy(&bytes).into_owned()
+}
+
+/// The name of a pyramid, which the storage can have.
+pub(super) fn pyramid(row: &Row) -> Result<String, Error> {
+    let name: String = row.get("pyramid")?;
+    match check_name(&name) {
+        Ok(()) => Ok(name),
+        Err(e) => Err(decode("pyramid", e)),
+    }
 }
 
 fn small(row: &Row, column: &str) -> Result<u32, Error> {
@@ -79,6 +95,7 @@ fn impossible(volume: &Volume, name: &str) -> Option<String> {
         () if volume.name != name => return Some(format!("it is of a volume {:?}", volume.name)),
         () if volume.levels.is_empty() => "it has no levels",
         () if volume.channels.is_empty() => "it has no channels",
+        () if volume.extent().max_element() > MAX_EXTENT => "it is larger than a volume can be",
         () if sizes.any(|size| size.min_element() == 0) => "a level or its chunks have no voxels",
         () => return None,
     };
@@ -101,12 +118,34 @@ pub(super) fn tile_or_spoilt(row: &Row) -> Result<Result<Tile, SpoiltTile>, Erro
     // Put anywhere, it is one: then only where it lies cannot be.
     let elsewhere = tile_at(row, SectionFromTile::IDENTITY).ok();
     Ok(Err(SpoiltTile {
-        name: row.get("name")?,
-        section: section(row)?,
-        pyramid: row.get("pyramid")?,
+        id: TileId(row.get("id")?),
+        name: row.get("name").map_err(|_| legible(row, "name")),
+        section: section(row).ok(),
+        pyramid: pyramid(row).map_err(|_| legible(row, "pyramid")),
+        position: unsigned(row, "position").ok(),
         reason: reason_of(error),
         size: elsewhere.map(|tile| tile.size),
     }))
+}
+
+/// The same, where it also has to be understood which records it is of.
+pub(super) fn tile_whose_records_are_known(row: &Row) -> Result<Result<Tile, SpoiltTile>, Error> {
+    let of = ["position", "transform_position"];
+    let known = of
+        .into_iter()
+        .try_for_each(|at| unsigned(row, at).map(drop));
+    match (tile_or_spoilt(row)?, known) {
+        (Ok(tile), Err(error)) => Ok(Err(SpoiltTile {
+            id: tile.id,
+            name: Ok(tile.name),
+            section: Some(tile.section),
+            pyramid: Ok(tile.pyramid),
+            position: unsigned(row, "position").ok(),
+            reason: reason_of(error),
+            size: None,
+        })),
+        (tile, _) => Ok(tile),
+    }
 }
 
 fn tile(row: &Row) -> Result<Tile, Error> {
@@ -121,7 +160,7 @@ fn tile_at(row: &Row, transform: SectionFromTile) -> Result<Tile, Error> {
         channel: small(row, "channel")?,
         size: size(row)?,
         transform,
-        pyramid: row.get("pyramid")?,
+        pyramid: pyramid(row)?,
         revision: unsigned(row, "revision")?,
     })
 }
@@ -158,11 +197,14 @@ pub(super) fn change(row: &Row) -> Result<CatalogChange, Error> {
 pub(super) fn quarantined(row: &Row) -> Result<Quarantined, Error> {
     let bytes: Option<i64> = row.get("bytes")?;
     Ok(Quarantined {
-        file: row.get("file")?,
-        tile: row.get("tile")?,
-        reason: row.get("reason")?,
+        // For people to read: what can be read of it.
+        file: legible(row, "file"),
+        tile: row
+            .get("tile")
+            .unwrap_or_else(|_| Some(legible(row, "tile"))),
+        reason: legible(row, "reason"),
         bytes: bytes.map(i64::unsigned_abs),
-        at: time(row, "at")?,
+        at: time(row, "at").unwrap_or(UNIX_EPOCH),
     })
 }
 
@@ -185,8 +227,8 @@ pub(super) fn waiting(row: &Row) -> Result<Waiting, Error> {
 
 pub(super) fn retired(row: &Row) -> Result<Retired, Error> {
     Ok(Retired {
-        pyramid: row.get("pyramid")?,
-        at: time(row, "at")?,
+        pyramid: legible(row, "pyramid"),
+        at: time(row, "at").unwrap_or(UNIX_EPOCH),
     })
 }
 
@@ -201,17 +243,18 @@ pub(super) fn claim(row: &Row) -> Result<Claim, Error> {
 
 pub(super) fn origin(row: &Row) -> Result<Origin, Error> {
     Ok(Origin {
-        tile: row.get("name")?,
-        position: unsigned(row, "position")?,
-        transform_position: unsigned(row, "transform_position")?,
+        tile: legible(row, "name"),
+        // One that cannot be is no record's.
+        position: unsigned(row, "position").unwrap_or(u64::MAX),
+        transform_position: unsigned(row, "transform_position").unwrap_or(u64::MAX),
     })
 }
 
 pub(super) fn held_up(row: &Row) -> Result<HeldUp, Error> {
     Ok(HeldUp {
-        worker: row.get("name")?,
-        why: row.get("why")?,
-        since: time(row, "since")?,
+        worker: legible(row, "name"),
+        why: legible(row, "why"),
+        since: time(row, "since").unwrap_or(UNIX_EPOCH),
     })
 }
 

@@ -3,7 +3,7 @@
 use glam::UVec2;
 
 use super::database::Row;
-use super::{Catalog, CatalogError, Tile, VolumeEntry, rows};
+use super::{Catalog, CatalogError, Tile, TileId, VolumeEntry, rows};
 
 /// A volume that the catalog names.
 #[derive(Debug)]
@@ -17,12 +17,16 @@ pub struct Listed {
 /// A tile of which the catalog says what cannot be.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SpoiltTile {
-    /// Its name.
-    pub name: String,
-    /// Section: z index of the volume.
-    pub section: u32,
-    /// Name of its pyramid in the storage.
-    pub pyramid: String,
+    /// Its id.
+    pub id: TileId,
+    /// Its name, or what can be read of one that is no text.
+    pub name: Result<String, String>,
+    /// Section: z index of the volume, if there is such a one.
+    pub section: Option<u32>,
+    /// Name of its pyramid in the storage, or what can be read where the storage cannot have it.
+    pub pyramid: Result<String, String>,
+    /// Position of its record, where that was asked for and can be.
+    pub position: Option<u64>,
     /// What cannot be.
     pub reason: String,
     /// Width and height \[pixels\], if all but its transform is as it can be.
@@ -30,7 +34,7 @@ pub struct SpoiltTile {
 }
 
 impl Catalog {
-    /// The tiles of a section, by id, and those of which nothing can be understood.
+    /// The tiles of a section, by id, and those of which something cannot be understood, be it which records they are of.
     ///
     /// # Errors
     ///
@@ -42,10 +46,46 @@ impl Catalog {
     ) -> Result<Vec<Result<Tile, SpoiltTile>>, CatalogError> {
         let id = self.volume_id(volume).await?;
         let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                        pyramid, revision FROM tiles \
+                        pyramid, revision, position, transform_position FROM tiles \
                         WHERE volume = $1 AND section = $2 AND deleted = 0 ORDER BY id";
         let values = [id.into(), z.into()];
-        self.ask(question, &values, rows::tile_or_spoilt).await
+        self.ask(question, &values, rows::tile_whose_records_are_known)
+            .await
+    }
+
+    /// The tiles that are in no section that can be, by id.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn rows_without_section(
+        &self,
+        volume: &str,
+    ) -> Result<Vec<SpoiltTile>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                        pyramid, revision, position, transform_position FROM tiles WHERE volume = $1 AND deleted = 0 \
+                        AND (section < 0 OR section > 4294967295) ORDER BY id";
+        let rows = self
+            .ask(question, &[id.into()], rows::tile_whose_records_are_known)
+            .await?;
+        Ok(rows.into_iter().filter_map(Result::err).collect())
+    }
+
+    /// Whether anything is known of a tile: it is there, or was deleted, or waits, or is in quarantine.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn knows(&self, volume: &str, tile: &str) -> Result<bool, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        // In one question, so that none that goes from one to another meanwhile is missed.
+        let question = "SELECT (SELECT count(*) FROM tiles WHERE volume = $1 AND name = $2) \
+                        + (SELECT count(*) FROM waiting WHERE volume = $1 AND tile = $2) \
+                        + (SELECT count(*) FROM quarantine WHERE volume = $1 AND tile = $2) AS known";
+        let known = |row: &Row| row.get::<i64>("known");
+        let known = self.ask(question, &[id.into(), tile.into()], known).await?;
+        Ok(known.into_iter().any(|known| known > 0))
     }
 
     /// All of them, or the error of the first that is spoilt.
@@ -56,7 +96,7 @@ impl Catalog {
     ) -> Result<Vec<Tile>, CatalogError> {
         let whole = rows.into_iter().collect::<Result<_, _>>();
         whole.map_err(|spoilt: SpoiltTile| CatalogError::SpoiltTile {
-            tile: spoilt.name,
+            tile: spoilt.name.unwrap_or_else(|legible| legible),
             volume: volume.to_owned(),
             reason: spoilt.reason,
             location: self.location().clone(),

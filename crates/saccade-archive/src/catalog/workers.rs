@@ -4,6 +4,7 @@ use std::time::{Duration, SystemTime};
 
 use super::database::{Database, Durability, Row, Statement, Transaction};
 use super::{Catalog, CatalogError, Waiting, rows};
+use crate::acquisition::RecordReader;
 
 /// One that claims records, as the catalog knows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -201,7 +202,7 @@ impl Catalog {
                      UPDATE waiting SET worker = $2, \
                        attempts = attempts + begun, begun = 0 \
                      WHERE volume = $1 AND position IN (SELECT position FROM free) \
-                     RETURNING position, record, reason, attempts, parked",
+                     RETURNING position, tile, record, reason, attempts, parked",
             // A record that is being given back or done right now is passed over rather than waited for.
             postgres: "WITH free AS MATERIALIZED ( \
                          SELECT w.position FROM waiting w WHERE w.volume = $1 \
@@ -212,7 +213,7 @@ impl Catalog {
                        UPDATE waiting SET worker = $2, \
                        attempts = attempts + begun, begun = 0 \
                        WHERE volume = $1 AND position IN (SELECT position FROM free) \
-                       RETURNING position, record, reason, attempts, parked",
+                       RETURNING position, tile, record, reason, attempts, parked",
         };
         let values = [
             volume.into(),
@@ -221,10 +222,18 @@ impl Catalog {
             max.into(),
         ];
         let claimed = transaction.all(claim, &values).await;
-        let claims = claimed.and_then(|rows| rows.iter().map(rows::claim).collect());
-        let mut claims: Vec<Claim> = claims.map_err(|e| self.failed(e))?;
+        let mut claims = Vec::new();
+        for row in claimed.map_err(|e| self.failed(e))? {
+            match rows::claim(&row) {
+                Ok(claim) => claims.push(claim),
+                Err(error) => {
+                    let done = set_aside(&mut transaction, volume, &row, error).await;
+                    done.map_err(|e| self.failed(e))?;
+                }
+            }
+        }
         transaction.commit().await.map_err(|e| self.failed(e))?;
-        claims.sort_by_key(|claim| claim.waiting.position);
+        claims.sort_by_key(|claim: &Claim| claim.waiting.position);
         Ok(claims)
     }
 
@@ -357,4 +366,33 @@ impl Catalog {
             }
         }
     }
+}
+
+/// Puts into quarantine what is in the queue and cannot be understood: nobody could work on it.
+async fn set_aside(
+    transaction: &mut Transaction,
+    volume: i64,
+    row: &Row,
+    error: sqlx::Error,
+) -> Result<(), sqlx::Error> {
+    let (tile, reason) = (rows::legible(row, "tile"), rows::reason_of(error));
+    let reason = format!(
+        "what the catalog keeps of its record cannot be understood ({reason}); append the record once more"
+    );
+    let insert = "INSERT INTO quarantine (volume, file, tile, reason, bytes, at) \
+                  VALUES ($1, $2, $3, $4, 0, $5)";
+    let values = [
+        volume.into(),
+        RecordReader::FILE.into(),
+        (&tile).into(),
+        (&reason).into(),
+        rows::millis(SystemTime::now()).into(),
+    ];
+    transaction.run(insert, &values).await?;
+    let position = row.get::<i64>("position")?;
+    let forget = "DELETE FROM waiting WHERE volume = $1 AND position = $2";
+    transaction
+        .run(forget, &[volume.into(), position.into()])
+        .await?;
+    Ok(())
 }

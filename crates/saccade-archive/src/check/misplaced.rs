@@ -5,6 +5,7 @@ use std::hash::BuildHasher as _;
 use glam::UVec2;
 use saccade_core::transform::SectionFromTile;
 
+use super::repair::position_of;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
 use crate::acquisition::Record;
 use crate::catalog::{CatalogError, SpoiltTile, Tile, VolumeEntry, place};
@@ -41,31 +42,71 @@ impl Check<'_> {
         entry: &VolumeEntry,
         tile: SpoiltTile,
     ) -> Result<(), CheckError> {
-        self.named.insert(self.hasher.hash_one(&tile.pyramid));
+        let pyramid = tile.pyramid.as_ref().ok();
+        let position = { tile.position }.or_else(|| position_of(pyramid?));
+        if let Some(pyramid) = pyramid {
+            self.named.insert(self.hasher.hash_one(pyramid));
+        } else if let Some(position) = position {
+            self.kept.insert((entry.volume.name.clone(), position));
+        }
         let mut reason = format!("what the catalog says of it cannot be ({})", tile.reason);
-        let repair = match tile.size {
-            Some(size) if self.options.repair => {
-                let said = self.said(entry, &tile.name, &tile.pyramid, tile.section, size);
-                let said = said.await?;
-                self.put(entry, &tile.name, said, &mut reason).await?
-            }
-            Some(_) => None,
-            None => {
-                reason.push_str(
-                    "; append the tile's record to its acquisition once more, and ingest enters it anew",
-                );
-                None
-            }
+        let name = tile.name.as_ref().ok().map(String::as_str);
+        let repair = match (name, pyramid, tile.section.zip(tile.size)) {
+            // Only where it lies cannot be.
+            (Some(name), Some(pyramid), Some((section, size))) => match self.options.repair {
+                true => {
+                    let said = self.said(entry, name, pyramid, section, size).await?;
+                    self.put(entry, name, said, &mut reason).await?
+                }
+                false => None,
+            },
+            _ => self.enter_anew(entry, &tile, position, &mut reason).await?,
         };
         self.report.findings.push(Finding {
             kind: FindingKind::Spoilt,
             volume: Some(entry.volume.name.clone()),
-            tile: Some(tile.name),
-            object: Some(tile.pyramid),
+            tile: Some(tile.name.unwrap_or_else(|legible| legible)),
+            object: Some(tile.pyramid.unwrap_or_else(|legible| legible)),
             reason,
             repair,
         });
         Ok(())
+    }
+
+    /// Has ingest enter a tile anew whose row cannot be understood, or says what is to be done.
+    async fn enter_anew(
+        &mut self,
+        entry: &VolumeEntry,
+        tile: &SpoiltTile,
+        position: Option<u64>,
+        reason: &mut String,
+    ) -> Result<Option<Repair>, CheckError> {
+        let name = tile.name.as_ref().ok().map(String::as_str);
+        let record = position.and_then(|at| Some((at, self.tile_record(entry, name, at)?)));
+        let Some((position, record)) = record else {
+            reason.push_str(match name {
+                Some(_) => {
+                    "; append the tile's record to its acquisition once more, and ingest enters it anew; with --acquisition \
+                     FOLDER, --repair does so"
+                }
+                None => "; with --acquisition FOLDER the records tell which tile it is",
+            });
+            return Ok(None);
+        };
+        if let Some(records) = &mut self.records {
+            records.meet(&record.tile);
+        }
+        if !self.options.repair {
+            return Ok(None);
+        }
+        if name.is_none() {
+            let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+            commit.end_nameless(tile.id).await?;
+            commit.finish().await?;
+        }
+        let why = format!("what the catalog said of it could not be ({})", tile.reason);
+        self.queue(entry, position, record, why).await?;
+        Ok(Some(Repair::Queued))
     }
 
     /// Nothing is known of a volume: neither its tiles nor its objects are looked at.
@@ -92,12 +133,11 @@ impl Check<'_> {
         size: UVec2,
     ) -> Result<Option<SectionFromTile>, CheckError> {
         let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let read = catalog.cursor(volume).await?;
         let origins = catalog.origins(volume, pyramid).await?;
         let origin = origins.into_iter().find(|origin| origin.tile == tile);
         Ok(origin.and_then(|origin| {
             let of = [origin.transform_position, origin.position];
-            let said = |at| match self.record_at(entry, at, read)?.1 {
+            let said = |at| match self.record_at(entry, at)?.1 {
                 Record::Tile(record) if record.tile == tile => Some(record.transform),
                 Record::Transform(record) if record.tile == tile => Some(record.transform),
                 _ => None,
@@ -121,10 +161,16 @@ impl Check<'_> {
             moved.await?;
             return Ok(Some(Repair::Moved));
         }
-        reason.push_str(
-            ", and no record is to be had that says where it lies: name the folder of the acquisition with \
-             --acquisition, or say with `saccade update` where it lies, or that it is no more",
-        );
+        reason.push_str(match self.folder_of(entry) {
+            Some(_) => {
+                ", and no record of the acquisition's folder says where else it lies: append one, or say with \
+                 `saccade update` where it lies, or that it is no more"
+            }
+            None => {
+                ", and no record is to be had that says where it lies: name the folder of the acquisition with \
+                 --acquisition, or say with `saccade update` where it lies, or that it is no more"
+            }
+        });
         Ok(None)
     }
 }

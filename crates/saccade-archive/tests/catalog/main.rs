@@ -9,6 +9,7 @@ mod place;
 mod postgres;
 mod properties;
 mod server;
+mod spoilt;
 mod sqlite;
 mod suite;
 mod workers;
@@ -48,6 +49,10 @@ on_both! {
     suite::other_processes_commits_are_heard,
     suite::several_writers_take_turns,
     suite::other_sizes_and_unknown_names_are_refused,
+    spoilt::a_spoilt_tile_is_told_and_goes_with_its_next_record,
+    spoilt::where_a_tile_of_no_size_lies_is_kept_until_it_has_one,
+    spoilt::what_is_queued_and_cannot_be_understood_is_set_aside,
+    spoilt::what_a_tile_names_is_not_on_the_list_of_what_is_to_be_deleted,
     workers::workers_share_what_is_to_be_done,
     workers::a_dead_workers_claims_return,
     workers::a_sign_of_life_keeps_claims,

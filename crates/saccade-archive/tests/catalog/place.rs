@@ -34,6 +34,24 @@ impl Place {
         &self.location
     }
 
+    /// Does what no program of ours does.
+    pub(crate) async fn meddle(&self, statement: &str) {
+        let statement = sqlx::AssertSqlSafe(statement.to_owned());
+        match &self.location {
+            CatalogLocation::File(path) => {
+                let pool = sqlx::SqlitePool::connect(path.to_str().unwrap()).await;
+                let pool = pool.unwrap();
+                sqlx::query(statement).execute(&pool).await.unwrap();
+                pool.close().await;
+            }
+            CatalogLocation::Postgres(url) => {
+                let pool = sqlx::PgPool::connect(url).await.unwrap();
+                sqlx::query(statement).execute(&pool).await.unwrap();
+                pool.close().await;
+            }
+        }
+    }
+
     /// The catalog there, with volume `v`.
     pub(crate) async fn catalog(&self) -> Catalog {
         let catalog = Catalog::create(&self.location).await.unwrap();

@@ -302,9 +302,10 @@ impl Context<'_> {
     /// A name for the pyramid of a record that no entered pyramid has: one that is made anew, since it was damaged, is
     /// another, so that whoever has kept something of the damaged one does not take it for this.
     async fn unused_name(&self, record: &TileRecord, position: u64) -> Result<String, IngestError> {
-        let entered = || self.catalog.tile(self.volume, &record.tile);
+        // Also of a tile of which nothing else can be understood, which this record mends.
+        let entered = || self.catalog.tile_pyramid(self.volume, &record.tile);
         let entered = retry(self.options, self.progress, entered).await?;
-        let attempt = entered.map_or(0, |tile| attempt_after(&tile.pyramid, position));
+        let attempt = entered.map_or(0, |pyramid| attempt_after(&pyramid, position));
         Ok(pyramid_name(self.volume, record, position, attempt))
     }
 

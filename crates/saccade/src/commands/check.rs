@@ -33,9 +33,10 @@ pub(crate) struct Check {
     #[arg(long)]
     repair: bool,
 
-    /// Folder that the microscope wrote to, from which damaged tiles can be made anew [default: of volumes from --pattern
-    /// or a list what is kept of them, else none]
-    #[arg(long, value_name = "FOLDER", requires = "repair")]
+    /// Folder that the microscope wrote to: its records tell whether the catalog has every tile as it should be, and with
+    /// --repair damaged and lost tiles are made anew from them [default: of volumes from --pattern or a list what is kept of
+    /// them, else none]
+    #[arg(long, value_name = "FOLDER")]
     acquisition: Option<PathBuf>,
 
     /// Print the report as JSON [default: as text]
@@ -88,6 +89,7 @@ fn name(kind: FindingKind) -> &'static str {
         FindingKind::Misplaced => "misplaced",
         FindingKind::Shared => "shared",
         FindingKind::Spoilt => "spoilt",
+        FindingKind::Lost => "lost",
         FindingKind::Miscounted => "miscounted",
         FindingKind::Orphan => "orphan",
         _ => "wrong",
@@ -109,6 +111,8 @@ fn line(finding: &Finding) -> String {
     line.push_str(match finding.repair {
         Some(Repair::Deleted) => "; deleted",
         Some(Repair::Recounted) => "; counted anew",
+        Some(Repair::Kept) => "; it is kept",
+        Some(Repair::Reread) => "; `saccade ingest` goes on from what it has",
         Some(Repair::Moved) => "; moved to where its records say",
         Some(Repair::Queued) => "; `saccade ingest` makes it anew",
         Some(Repair::Quarantined) => "; set aside: append its record once more",

@@ -1,0 +1,152 @@
+//! Rows that no program of ours writes.
+
+use std::time::SystemTime;
+
+use saccade_archive::catalog::{
+    CatalogError, DeleteOutcome, TileOutcome, TransformOutcome, Waiting, place as lies,
+};
+use std::time::Duration;
+
+use crate::place::Place;
+use crate::suite::{EXTENT, SIZE, all_changes, at, tile, waiting};
+
+const SPOILT: [&str; 4] = [
+    "width = -5",
+    "section = -1",
+    "pyramid = ''",
+    "position = -3, transform_position = -3",
+];
+
+pub(crate) async fn a_spoilt_tile_is_told_and_goes_with_its_next_record(place: &Place) {
+    for how in SPOILT {
+        let catalog = place.catalog().await;
+        for (name, section) in [("a", 0), ("b", 0)] {
+            let new = tile(name, section, at(0.0, 0.0), 1);
+            catalog.commit_tile("v", &new).await.unwrap();
+        }
+        let spoil = format!("UPDATE tiles SET {how} WHERE name = 'b'");
+        place.meddle(&spoil).await;
+        // It is told, beside the one that is whole.
+        let mut rows = catalog.section_rows("v", 0).await.unwrap();
+        rows.extend(
+            catalog
+                .rows_without_section("v")
+                .await
+                .unwrap()
+                .into_iter()
+                .map(Err),
+        );
+        let names: Vec<_> = { rows.iter() }
+            .map(|row| {
+                row.as_ref()
+                    .map(|tile| &*tile.name)
+                    .map_err(|s| s.name.as_deref())
+            })
+            .collect();
+        assert_eq!(names, [Ok("a"), Err(Ok("b"))], "{how}");
+        let entry = catalog.entry("v").await.unwrap();
+        assert_eq!(entry.tiles, 2);
+        // Its next record takes its place, and its last one ends it.
+        let new = tile("b", 1, at(5.0, 0.0), 2);
+        let outcome = catalog.commit_tile("v", &new).await.unwrap();
+        assert_eq!(outcome, TileOutcome::Replaced, "{how}");
+        let now = catalog.tile("v", "b").await.unwrap().unwrap();
+        assert_eq!((now.section, now.transform), (1, at(5.0, 0.0)));
+        assert_eq!(catalog.sections("v").await.unwrap(), [0, 1]);
+        place.meddle(&spoil).await;
+        let deleted = catalog.delete_tile("v", "b", 3).await.unwrap();
+        assert_eq!(deleted, DeleteOutcome::Deleted, "{how}");
+        assert_eq!(catalog.sections("v").await.unwrap(), [0], "{how}");
+        assert_eq!(catalog.entry("v").await.unwrap().tiles, 1, "{how}");
+        assert!(catalog.knows("v", "b").await.unwrap());
+        assert!(!catalog.knows("v", "c").await.unwrap());
+        catalog.delete_tile("v", "a", 3).await.unwrap();
+        catalog.close().await;
+        place.meddle("DELETE FROM changes").await;
+        place.meddle("DELETE FROM retired").await;
+        place.meddle("DELETE FROM sections").await;
+        place.meddle("DELETE FROM tiles").await;
+        place.meddle("DELETE FROM volumes").await;
+    }
+}
+
+pub(crate) async fn where_a_tile_of_no_size_lies_is_kept_until_it_has_one(place: &Place) {
+    let catalog = place.catalog().await;
+    let new = tile("a", 0, at(0.0, 0.0), 1);
+    catalog.commit_tile("v", &new).await.unwrap();
+    place.meddle("UPDATE tiles SET width = -1").await;
+    let told = catalog.section_tiles("v", 0).await.unwrap_err();
+    assert!(matches!(told, CatalogError::SpoiltTile { .. }), "{told}");
+    let mut commit = catalog.begin("v").await.unwrap();
+    let moved = commit.transform("a", at(7.0, 1.0), Some(2)).await.unwrap();
+    assert_eq!(moved, TransformOutcome::Kept);
+    commit.finish().await.unwrap();
+    let before = all_changes(&catalog).await.len();
+    // The same record as before, worked on once more.
+    catalog.commit_tile("v", &new).await.unwrap();
+    let now = catalog.tile("v", "a").await.unwrap().unwrap();
+    assert_eq!(now.transform, at(7.0, 1.0));
+    // Its section could not be read, and can be: who has kept an error learns of it.
+    let whole = lies(EXTENT, 0, EXTENT.truncate(), at(0.0, 0.0)).unwrap();
+    let changes = all_changes(&catalog).await;
+    assert_eq!(changes.len(), before + 1);
+    assert_eq!(changes[before].voxels, whole);
+    assert!(SIZE.x < EXTENT.x);
+}
+
+pub(crate) async fn what_is_queued_and_cannot_be_understood_is_set_aside(place: &Place) {
+    let catalog = place.catalog().await;
+    let mut commit = catalog.begin("v").await.unwrap();
+    for (at_byte, name) in [(1, "a"), (2, "b"), (3, "c")] {
+        let one: Waiting = waiting(name, 0, at(0.0, 0.0), at_byte);
+        commit.enqueue(&one).await.unwrap();
+    }
+    commit.finish().await.unwrap();
+    place
+        .meddle("UPDATE waiting SET record = '{' WHERE tile = 'b'")
+        .await;
+    let spoilt = catalog.spoilt_waiting("v").await.unwrap();
+    let spoilt: Vec<_> = spoilt.iter().map(|(at, tile, _)| (*at, &**tile)).collect();
+    assert_eq!(spoilt, [(2, "b")]);
+    let worker = catalog
+        .register("w", Duration::from_secs(60))
+        .await
+        .unwrap();
+    let claims = catalog.claim("v", &worker, 9).await.unwrap();
+    let claims: Vec<_> = { claims.iter() }
+        .map(|claim| &*claim.waiting.record.tile)
+        .collect();
+    assert_eq!(claims, ["a", "c"]);
+    let set_aside = catalog.quarantined("v").await.unwrap();
+    assert_eq!(set_aside.len(), 1);
+    assert_eq!(set_aside[0].tile.as_deref(), Some("b"));
+    assert!(set_aside[0].at <= SystemTime::now());
+    assert_eq!(catalog.queued("v").await.unwrap(), (2, 0));
+}
+
+pub(crate) async fn what_a_tile_names_is_not_on_the_list_of_what_is_to_be_deleted(place: &Place) {
+    let catalog = place.catalog().await;
+    let mut new = tile("a", 0, at(0.0, 0.0), 1);
+    for (section, name) in [(0, "tiles/v/000000/a-1.tif"), (1, "tiles/v/000001/a-2.tif")] {
+        (new.section, new.pyramid, new.position) = (section, name.to_owned(), section.into());
+        catalog.commit_tile("v", &new).await.unwrap();
+    }
+    let named = async |name: &str| catalog.is_named("v", name).await.unwrap();
+    assert!(!named("tiles/v/000000/a-1.tif").await);
+    assert!(named("tiles/v/000001/a-2.tif").await);
+    // A row that somebody has moved elsewhere is found by the tile's name, and any by a name of another kind.
+    place.meddle("UPDATE tiles SET section = 5").await;
+    assert!(named("tiles/v/000001/a-2.tif").await);
+    place
+        .meddle("UPDATE tiles SET pyramid = 'elsewhere.tif'")
+        .await;
+    assert!(named("elsewhere.tif").await);
+    let later = SystemTime::now() + Duration::from_secs(600);
+    assert_eq!(catalog.retired("v", later, 9).await.unwrap().len(), 1);
+    new.position = 9;
+    new.pyramid = "tiles/v/000000/a-1.tif".to_owned();
+    catalog.commit_tile("v", &new).await.unwrap();
+    let retired = catalog.retired("v", later, 9).await.unwrap();
+    let retired: Vec<_> = retired.into_iter().map(|r| r.pyramid).collect();
+    assert_eq!(retired, ["elsewhere.tif"]);
+}
