@@ -12,6 +12,7 @@ use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
 use saccade_archive::catalog::{CatalogError, Waiting, Worker};
+use saccade_archive::storage::StorageError;
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
@@ -335,21 +336,32 @@ impl Ingest<'_> {
         let volume = self.context.volume;
         let list = || catalog.retired(volume, before, DELETE_AT_ONCE);
         let retired = retry(self.options, self.context.progress, list).await?;
-        let mut deleted = Vec::new();
+        let mut done = Vec::new();
         for old in retired {
+            let named = || catalog.is_named(volume, &old.pyramid);
+            if retry(self.options, self.context.progress, named).await? {
+                log::warn!(
+                    "a tile names the pyramid {}, which was to be deleted: it is kept",
+                    old.pyramid
+                );
+                done.push(old.pyramid);
+                continue;
+            }
             match self.archive.storage().delete(&old.pyramid).await {
-                Ok(()) => deleted.push(old.pyramid),
+                Ok(()) => done.push(old.pyramid),
+                // There is none.
+                Err(StorageError::Name { .. }) => done.push(old.pyramid),
                 // They stay on the list. What is written next waits, and says so.
                 Err(e) if e.is_outage() => break,
                 Err(e) => log::warn!("cannot delete the replaced pyramid {}: {e}", old.pyramid),
             }
         }
-        if deleted.is_empty() {
+        if done.is_empty() {
             return Ok(());
         }
         retry(self.options, self.context.progress, async || {
             let mut commit = catalog.begin(volume).await?;
-            for pyramid in &deleted {
+            for pyramid in &done {
                 commit.forget_retired(pyramid).await?;
             }
             commit.finish().await

@@ -14,5 +14,6 @@ mod postgres;
 mod quarantine;
 mod replaced;
 mod scope;
+mod spoilt;
 mod stream;
 mod workers;
