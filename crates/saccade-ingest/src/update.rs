@@ -118,12 +118,17 @@ pub fn read(mut input: impl BufRead, name: &str) -> Result<Vec<Line>, UpdateErro
             mistakes.push(format!("line {line} is no record, but longer than any"));
             break;
         }
+        // Some editors begin a text with a mark.
+        let text = match line {
+            1 => text.strip_prefix("\u{feff}".as_bytes()).unwrap_or(&text),
+            _ => &text[..],
+        };
         if text.iter().all(u8::is_ascii_whitespace) {
             continue;
         }
-        let reason = match Record::parse(&text) {
+        let reason = match Record::parse(text) {
             Ok(Record::Transform(record)) => {
-                let wrong = unknown_key(&text, &["record", "tile", "transform"]);
+                let wrong = unknown_key(text, &["record", "tile", "transform"]);
                 let nonsense = || Some(format!("{}; check {CHECK}", nonsense(record.transform)?));
                 match wrong.or_else(nonsense) {
                     Some(reason) => reason,
@@ -134,7 +139,7 @@ pub fn read(mut input: impl BufRead, name: &str) -> Result<Vec<Line>, UpdateErro
                     }
                 }
             }
-            Ok(Record::Delete(record)) => match unknown_key(&text, &["record", "tile"]) {
+            Ok(Record::Delete(record)) => match unknown_key(text, &["record", "tile"]) {
                 Some(reason) => reason,
                 None => {
                     let change = Change::Delete(record);

@@ -8,6 +8,7 @@ mod writer;
 
 use glam::UVec2;
 use saccade_core::transform::SectionFromTile;
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -164,12 +165,22 @@ fn parse(text: &[u8]) -> Result<Record, String> {
             None => Ok(Record::Tile(tile)),
         },
         Ok(record) => Ok(record),
+        // What the parser says of it is meant for programmers.
+        Err(_) if is_other_value(text) => Err(
+            "it is no object; a record is one, such as {\"record\": \"delete\", \"tile\": ..}"
+                .to_owned(),
+        ),
         Err(_) if is_utf16(text) => Err("it is UTF-16; write it as UTF-8".to_owned()),
         Err(error) => Err(match hint(text, &KEYS) {
             Some(hint) => format!("{}; {hint}", cut(&error.to_string())),
             None => cut(&error.to_string()),
         }),
     }
+}
+
+/// Whether a text is JSON, but no object.
+fn is_other_value(text: &[u8]) -> bool {
+    !text.trim_ascii_start().starts_with(b"{") && serde_json::from_slice::<IgnoredAny>(text).is_ok()
 }
 
 /// A key that is almost one of these, as it is told.

@@ -170,6 +170,10 @@ fn wrong_lines_are_named_with_their_file() {
     let long = refuse(&format!("{good}\n{}", " ".repeat(1 << 20)));
     assert!(long.contains("line 2 is no record"), "{long}");
     assert_eq!(read(&b""[..], "nothing").unwrap(), []);
+    let null = refuse(&format!("{good}\n\nnull"));
+    assert!(null.contains("line 3: it is no object"), "{null}");
+    let marked = read(format!("\u{feff}{good}\n").as_bytes(), "marked");
+    assert_eq!(marked.unwrap(), lines(&[good]));
 }
 
 /// Whoever looks sees all of a section's tiles where they were, or all where they are now.
