@@ -9,7 +9,7 @@ use std::time::Duration;
 use futures::FutureExt;
 use futures::future::{join_all, try_join, try_join_all};
 use futures::stream::{self, StreamExt, TryStreamExt};
-use glam::DVec2;
+use glam::{DVec2, UVec2};
 use saccade_core::levels::Level;
 use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
@@ -359,7 +359,9 @@ impl Builder {
             return Ok(near.clone());
         }
         let index = self.tiles.index().section(section).await;
-        let index = index.map_err(|source| StitchError::Catalog { source })?;
+        let damaged = self.tiles.damaged();
+        let index = index.map_err(|source| damaged.note_section(section, source))?;
+        damaged.clear_section(section);
         Ok(index.near(channel, min, max))
     }
 
@@ -469,7 +471,14 @@ impl Builder {
                             candidates.push(Candidate::new(tile, image, of_pyramid, rules.labels));
                         }
                         Err(error) => {
-                            let error = self.tiles.damaged().note(&tile, error);
+                            let damaged = self.tiles.damaged();
+                            let thumbnail = tile.coarsest_level();
+                            let error = match of_pyramid >= thumbnail {
+                                true => {
+                                    damaged.note_sub_tiles(&tile, thumbnail, &[UVec2::ZERO], error)
+                                }
+                                false => damaged.note(&tile, error),
+                            };
                             failures.push(Failure::bounds(error, &tile, level, voxels));
                         }
                     }
@@ -518,11 +527,20 @@ impl Builder {
                 let canvas = canvases.entry(by);
                 let canvas = canvas.or_insert_with(|| Canvas::new(grid, by, rules));
                 let drawn = fetched.and_then(|fetched| canvas.draw(&tiles, &part, fetched));
-                let tile = &part.candidate.tile;
+                let (candidate, tile) = (&part.candidate, &part.candidate.tile);
+                let looked_at = || match &candidate.image {
+                    Image::Thumbnail(_) => (tile.coarsest_level(), vec![UVec2::ZERO]),
+                    Image::Pyramid(_) => {
+                        let wanted =
+                            candidate.sub_tiles(&grid, &part.segments, rules.interpolation);
+                        (candidate.level, wanted)
+                    }
+                };
                 match drawn {
-                    Ok(()) => tiles.damaged().clear(tile),
+                    Ok(()) => tiles.damaged().clear(tile, looked_at),
                     Err(error) => {
-                        let error = tiles.damaged().note(tile, error);
+                        let (level, wanted) = looked_at();
+                        let error = tiles.damaged().note_sub_tiles(tile, level, &wanted, error);
                         failures.push(Failure::segments(error, &part.segments, by));
                     }
                 }

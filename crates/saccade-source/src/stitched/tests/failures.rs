@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures::StreamExt;
-use glam::{DVec3, UVec3};
+use glam::{DVec3, UVec2, UVec3};
 use saccade_archive::catalog::NewTile;
 use saccade_archive::image::GrayImage;
-use saccade_archive::pyramid::{Encoding, encode, named};
+use saccade_archive::pyramid::{Encoding, PyramidIndex, encode, named};
 use saccade_core::volume::Dtype;
 
 use super::fixture::{Fixture, chunk_of, tile};
@@ -245,5 +245,65 @@ fn pyramids_of_other_types_are_refused() {
         let error = source.read(id).await.unwrap_err();
         let told = error.source().unwrap().to_string();
         assert!(told.contains("of 8 bits, its volume of 16"), "{told}");
+    });
+}
+
+/// Parts of a tile that can be read say nothing of those that cannot.
+#[test]
+fn a_tile_is_damaged_until_all_of_it_that_was_looked_at_can_be_read() {
+    run(async {
+        let mut fixture = Fixture::new(UVec3::new(640, 64, 1), DVec3::new(4.0, 4.0, 30.0)).await;
+        let pyramid = fixture
+            .put("wide", tile((640, 64), 0, (0.0, 0.0), 0.0, 1.0, 5))
+            .await;
+        let whole = fixture.storage.read(&pyramid, None).await.unwrap();
+        let index = PyramidIndex::open(&*fixture.storage, &pyramid)
+            .await
+            .unwrap();
+        let first = index.reads(0, vec![UVec2::ZERO], 0)[0].range.start;
+        let mut harmed = whole.to_vec();
+        harmed[usize::try_from(first).unwrap() + 9] ^= 8;
+        let write = fixture.storage.write_durable(&pyramid, harmed.into());
+        write.await.unwrap();
+        let options = StitchedOptions {
+            try_again: Duration::ZERO,
+            ..StitchedOptions::default()
+        };
+        let source = fixture.open_with(options).await;
+        assert!(source.read(id(0)).await.is_err());
+        assert!(source.read(id(9)).await.is_ok());
+        let damage = source.damage();
+        assert_eq!(damage.len(), 1, "{damage:?}");
+        assert_eq!(damage[0].object, pyramid);
+    });
+}
+
+#[test]
+fn a_tile_that_the_catalog_does_not_understand_is_told() {
+    run(async {
+        let (fixture, _) = two().await;
+        let catalog = fixture.archive.catalog();
+        let tile = catalog.tile("v", "left").await.unwrap().unwrap();
+        let spoilt = NewTile {
+            name: tile.name,
+            section: 1,
+            channel: 0,
+            size: tile.size,
+            transform: tile.transform,
+            pyramid: "../nowhere".to_owned(),
+            position: 99,
+        };
+        catalog.commit_tile("v", &spoilt).await.unwrap();
+        let source = fixture.open().await;
+        let error = source.read(id(0)).await.unwrap_err();
+        assert!(text(&error).contains("\"left\""), "{}", text(&error));
+        let damage = source.damage();
+        assert_eq!(damage.len(), 1, "{damage:?}");
+        assert_eq!((damage[0].section, &*damage[0].object), (1, "left"));
+        assert!(
+            damage[0].reason.contains("saccade check"),
+            "{}",
+            damage[0].reason
+        );
     });
 }
