@@ -106,10 +106,11 @@ async fn follow(following: Following) {
 async fn announce_all(catalog: &Inner) -> Result<(), sqlx::Error> {
     let volumes = "SELECT name, revision FROM volumes";
     for row in catalog.database.all(volumes, &[]).await? {
-        let name: String = row.get("name")?;
-        catalog
-            .watcher
-            .announce(&name, rows::unsigned(&row, "revision")?);
+        // One that is spoilt keeps no other from being told of.
+        let name = rows::legible(&row, "name");
+        if let Ok(revision) = rows::unsigned(&row, "revision") {
+            catalog.watcher.announce(&name, revision);
+        }
     }
     Ok(())
 }
