@@ -159,11 +159,8 @@ struct Busy<'a> {
     catalog_has: AtomicBool,
 }
 
-impl Progress for Busy<'_> {
-    fn update(&self, _: &State) {
-        if self.catalog_has.load(Ordering::Relaxed) {
-            return;
-        }
+impl Busy<'_> {
+    fn say_more(&self) {
         for _ in 0..4 {
             let n = self.said.fetch_add(1, Ordering::Relaxed);
             let Record::Tile(mut record) = tile_record(&format!("more{n}"), n % 4, SIZE) else {
@@ -171,6 +168,14 @@ impl Progress for Busy<'_> {
             };
             record.file = "tiles/first.tif".to_owned();
             self.scope.say(&Record::Tile(record));
+        }
+    }
+}
+
+impl Progress for Busy<'_> {
+    fn update(&self, _: &State) {
+        if !self.catalog_has.load(Ordering::Relaxed) {
+            self.say_more();
         }
     }
 
@@ -217,6 +222,7 @@ async fn a_busy_worker_takes_up_what_a_killed_one_had() {
         said: AtomicU32::new(0),
         catalog_has: AtomicBool::new(false),
     };
+    busy.say_more();
     let options = IngestOptions {
         once: false,
         lease,
@@ -226,8 +232,11 @@ async fn a_busy_worker_takes_up_what_a_killed_one_had() {
     let cancel = Cancel::new();
     let work = run(scope.path(), &archive, &options, &busy, &cancel);
     let watch = async {
-        while catalog.tile(VOLUME, "claimed").await.unwrap().is_none() {
-            tokio::time::sleep(Duration::from_millis(20)).await;
+        // What it does besides is done, too.
+        for tile in ["claimed", "more0"] {
+            while catalog.tile(VOLUME, tile).await.unwrap().is_none() {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
         }
         busy.catalog_has.store(true, Ordering::Relaxed);
         cancel.cancel();
@@ -236,7 +245,7 @@ async fn a_busy_worker_takes_up_what_a_killed_one_had() {
     let (done, ()) = tokio::time::timeout(Duration::from_secs(40), both)
         .await
         .expect("it is left to the killed worker");
-    assert!(done.unwrap().tiles > 1);
+    done.unwrap();
 }
 
 /// A record that ended worker after worker is set aside, and the others are done.
