@@ -186,6 +186,23 @@ impl ViewOptions {
                 ));
             }
         }
+        let transfers =
+            { self.transfers.iter() }.filter_map(|(of, transfer)| Some((of, transfer.as_ref()?)));
+        for (of, transfer) in transfers.filter(|(of, _)| of.is_none_or(|of| seen.contains(&of))) {
+            let of = of.map_or_else(String::new, |channel| format!(" of channel {channel}"));
+            let [low, high] = transfer.window;
+            if shown.drawn_mode() == Mode::EmissionAbsorption
+                && transfer.opacity.iter().all(|point| point.opacity <= 0.0)
+            {
+                told.push(format!(
+                    "--transfer{of} is transparent everywhere, so that nothing of it shows: give it points of \"opacity\" above 0"
+                ));
+            } else if low.min(high) >= 1.0 || low.max(high) <= 0.0 {
+                told.push(format!(
+                    "--transfer{of} has a window beyond all values, which are 0 to 1, so that all of them have one colour"
+                ));
+            }
+        }
         told.dedup();
         told
     }
@@ -437,6 +454,45 @@ mod tests {
         assert_eq!(told(&options), "");
         options.shown.heat = crate::shown::heat_from_text("nodes").ok();
         assert!(told(&options).contains("--heat"));
+    }
+
+    #[test]
+    fn transfer_functions_that_show_nothing_are_told() {
+        let size = glam::UVec3::new(90, 80, 70);
+        let volume = Volume::new("v", size, glam::DVec3::ONE).unwrap();
+        let with = |window: [f32; 2], opacities: &[f32], mode: Mode| {
+            let mut transfer =
+                saccade_core::transfer::Histogram::default().transfer_function(glam::DVec3::ONE);
+            transfer.window = window;
+            let points = opacities
+                .iter()
+                .map(|&opacity| saccade_core::transfer::OpacityPoint {
+                    value: 0.5,
+                    opacity,
+                });
+            transfer.opacity = points.collect();
+            let options = ViewOptions {
+                transfers: vec![(Some(0), Some(transfer))],
+                shown: Shown {
+                    mode,
+                    ..Shown::default()
+                },
+                ..ViewOptions::default()
+            };
+            options.without_effect(&volume).join("\n")
+        };
+        for opacities in [&[][..], &[0.0], &[0.0, 0.0]] {
+            assert!(with([0.0, 1.0], opacities, Mode::EmissionAbsorption).contains("transparent"));
+            assert_eq!(with([0.0, 1.0], opacities, Mode::Maximum), "");
+        }
+        for mode in [Mode::EmissionAbsorption, Mode::Maximum] {
+            for window in [[2.0, 3.0], [1.0, 1.5], [-2.0, 0.0]] {
+                assert!(with(window, &[0.5], mode).contains("window"), "{window:?}");
+            }
+            for window in [[0.0, 1.0], [-1.0, 0.1], [0.9, 2.0]] {
+                assert_eq!(with(window, &[0.0, 0.5], mode), "", "{window:?}");
+            }
+        }
     }
 
     #[test]

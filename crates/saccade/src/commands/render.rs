@@ -122,7 +122,8 @@ impl Render {
         .with_context(|| format!("cannot write the picture {}", self.output.display()))?;
         let counted = session.channels().iter().map(|c| c.histogram.total());
         let empty = status.revision == 0 && counted.sum::<u64>() == 0;
-        tell(&fidelity(&status, empty));
+        let levels = session.volume().levels.len();
+        tell(&fidelity(&status, levels, empty));
         if let Some(failure) = &status.progress.failure {
             say(&format!("not all could be read: {failure}"));
         }
@@ -130,8 +131,11 @@ impl Render {
     }
 }
 
-/// How true the picture is, on one line.
-fn fidelity(status: &Status, empty: bool) -> String {
+/// How true the picture is, on one line; of a volume of so many levels.
+fn fidelity(status: &Status, levels: usize, empty: bool) -> String {
+    if status.frame_time.is_none() {
+        return "one frame was drawn and not waited for: what it misses is not known".to_owned();
+    }
     let level = match status.fidelity.level {
         Some(level) => format!("level {level}"),
         None => "nothing of the volume in view".to_owned(),
@@ -141,7 +145,9 @@ fn fidelity(status: &Status, empty: bool) -> String {
         0 => String::new(),
         revision => format!(", revision {revision}"),
     };
-    let full = match status.memory_bias {
+    // Coarser than the coarsest there is none.
+    let most = u8::try_from(levels.saturating_sub(1)).unwrap_or(u8::MAX);
+    let full = match status.memory_bias.min(f32::from(most)) {
         bias if bias > 0.0 => format!(
             ", coarser by {bias:.1} levels: GPU memory is full; give more with --gpu-memory"
         ),

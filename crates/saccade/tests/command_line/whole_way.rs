@@ -382,4 +382,7 @@ fn what_is_not_complete_is_not_written_unless_wanted() {
     let output = run(late.iter().chain(&["--partial"]));
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(picture.exists());
+    // It is in view, whatever is known of it.
+    let said = stderr(&output);
+    assert!(!said.contains("nothing of the volume"), "{said}");
 }
