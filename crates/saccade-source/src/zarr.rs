@@ -239,7 +239,9 @@ async fn attributes(objects: &dyn Objects, folder: &str) -> Result<Option<Value>
             );
             return Err(refusal.at(objects.location(folder)));
         }
-        return Ok(Some(group["attributes"].take()));
+        // It may be no object at all.
+        let attributes = group.get_mut("attributes").map(Value::take);
+        return Ok(Some(attributes.unwrap_or_default()));
     }
     json(objects, &below(folder, ".zattrs")).await
 }
