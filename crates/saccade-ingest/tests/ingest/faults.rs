@@ -158,20 +158,22 @@ async fn an_archive_whose_disk_is_away_is_waited_for() {
 /// A file whose space is set aside first, and then filled.
 #[tokio::test]
 async fn a_file_that_is_filled_while_it_is_read_is_waited_for() {
-    const LARGE: UVec2 = UVec2::new(1200, 1000);
+    // Reading it takes many times as long as its writer rests.
+    const LARGE: UVec2 = UVec2::new(6000, 5000);
+    const PART: usize = 120_000;
     let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
     let archive = archive(folder.path()).await;
     let bytes = scope.image("t", LARGE, 7);
     // The head, and none of the pixels.
     let mut half = bytes.clone();
-    half[1000..1_199_000].fill(0);
+    half[1000..29_999_000].fill(0);
     let path = scope.file("t");
     fs::write(&path, half).unwrap();
     scope.say(&crate::scope::tile_record("t", 0, LARGE));
     let fill = std::thread::spawn(move || {
         let file = fs::OpenOptions::new().write(true).open(path).unwrap();
-        for (n, part) in bytes.chunks(5_000).enumerate() {
-            let at = u64::try_from(n * 5_000).unwrap();
+        for (n, part) in bytes.chunks(PART).enumerate() {
+            let at = u64::try_from(n * PART).unwrap();
             std::os::unix::fs::FileExt::write_all_at(&file, part, at).unwrap();
             std::thread::sleep(Duration::from_millis(5));
         }
