@@ -91,7 +91,18 @@ impl Scope {
     }
 
     fn watch(&self, config: ListConfig) -> ListWatch<Disk> {
-        ListWatch::open(config, Disk, &self.path(), &self.kept()).unwrap()
+        let open = || ListWatch::open(config.clone(), Disk, &self.path(), &self.kept()).unwrap();
+        let mut watch = open();
+        // A process that another test starts holds whatever is locked, for the moment until it is another program.
+        for _ in 0..50 {
+            if watch.leads() {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+            drop(watch);
+            watch = open();
+        }
+        watch
     }
 
     /// Follows the list to its end, and takes in what is there.
