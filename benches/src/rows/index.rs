@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use glam::{DVec2, UVec3};
 use saccade_archive::VisualizationArchive;
-use saccade_archive::catalog::Catalog;
 use saccade_core::transform::SectionPoint;
 use saccade_core::volume::Volume;
 use saccade_source::VolumeSource;
@@ -120,7 +119,7 @@ pub(super) fn resident() -> Result<u64> {
 }
 
 fn archive_folder() -> Result<PathBuf> {
-    Ok(cache_folder()?.join("bench/seven-million-tiles-1"))
+    Ok(cache_folder()?.join("bench/seven-million-tiles-2"))
 }
 
 /// Where builds and what rows keep for later runs are.
@@ -137,10 +136,10 @@ pub(super) fn cache_folder() -> Result<PathBuf> {
 async fn make(folder: &Path) -> Result<()> {
     let unfinished = folder.with_extension("unfinished");
     let _ = fs::remove_dir_all(&unfinished);
-    fs::create_dir_all(&unfinished)?;
     let file = unfinished.join(VisualizationArchive::CATALOG);
     let extent = UVec3::new(GRID.0 * PITCH, GRID.1 * PITCH, SECTIONS);
-    let catalog = Catalog::create(&file).await?;
+    let archive = VisualizationArchive::create(&unfinished).await?;
+    let catalog = archive.catalog();
     catalog
         .create_volume(&Volume::new(NAME, extent, VOXEL_NM)?)
         .await?;
