@@ -126,13 +126,7 @@ proptest! {
             let (got, want) = (read_all(&source).await, fixture.expected());
             let (coverage, most) = difference(&got, &want);
             prop_assert_eq!(coverage, 0);
-            let (_, finest) = difference(&got[..1].to_vec(), &want[..1].to_vec());
-            prop_assert!(finest <= 1, "{} grey levels", finest);
-            // A coarser voxel is the mean of samples that are rounded each, which may all be off the same way, in noise of the
-            // steepest kind: seldom.
-            let pairs = || got.iter().flatten().zip(want.iter().flatten());
-            let off = pairs().filter(|(got, want)| got.abs_diff(**want) > 1).count();
-            prop_assert!(most <= 2 && off <= 1 + pairs().count() / 100_000, "{} grey levels, {} voxels", most, off);
+            prop_assert!(most <= 1, "{} grey levels", most);
             Ok(())
         })?;
     }
