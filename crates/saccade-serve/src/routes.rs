@@ -151,7 +151,8 @@ pub(crate) fn router(app: App) -> Router {
 
 /// Refuses strangers, and more requests at once than can be answered.
 async fn admit(State(app): State<App>, request: Request, next: Next) -> Response {
-    if let Some(refusal) = app.gate.refuse(request.version(), request.headers()) {
+    let (version, target) = (request.version(), request.uri().host());
+    if let Some(refusal) = app.gate.refuse(version, target, request.headers()) {
         return refusal;
     }
     match app.requests.try_acquire() {

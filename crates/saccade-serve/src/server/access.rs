@@ -74,8 +74,13 @@ impl Gate {
         }
     }
 
-    /// The answer to a request that may not be made.
-    pub(crate) fn refuse(&self, version: Version, headers: &HeaderMap) -> Option<Response> {
+    /// The answer to a request that may not be made. `target` is the host that it is for by its first line, where that names one.
+    pub(crate) fn refuse(
+        &self,
+        version: Version,
+        target: Option<&str>,
+        headers: &HeaderMap,
+    ) -> Option<Response> {
         let mut hosts = headers.get_all(HOST).iter();
         let host = match (hosts.next(), hosts.next()) {
             (Some(host), None) => host.to_str().ok().and_then(|h| h.parse::<Authority>().ok()),
@@ -87,10 +92,10 @@ impl Gate {
             let error = "a request must name one host, and only one";
             return Some(refusal(StatusCode::BAD_REQUEST, error, Vec::new()));
         };
-        if !self.is_own(host.host()) {
+        let mut names = [target, Some(host.host())].into_iter().flatten();
+        if let Some(other) = names.find(|name| !self.is_own(name)) {
             let error = format!(
-                "this server does not go by the name {:?}; --allow-host gives it another name",
-                host.host()
+                "this server does not go by the name {other:?}; --allow-host gives it another name"
             );
             let known = self.names.iter().cloned().chain(["localhost".to_owned()]);
             return Some(refusal(
@@ -145,12 +150,16 @@ mod tests {
     }
 
     fn ask(gate: &Gate, headers: &[(HeaderName, &str)]) -> Option<u16> {
+        ask_for(gate, None, headers)
+    }
+
+    fn ask_for(gate: &Gate, target: Option<&str>, headers: &[(HeaderName, &str)]) -> Option<u16> {
         let headers = headers
             .iter()
             .map(|(name, value)| (name.clone(), value.parse().unwrap()));
         let mut map = HeaderMap::new();
         headers.for_each(|(name, value)| _ = map.append(name, value));
-        gate.refuse(Version::HTTP_11, &map)
+        gate.refuse(Version::HTTP_11, target, &map)
             .map(|refusal| refusal.status().as_u16())
     }
 
@@ -189,9 +198,16 @@ mod tests {
             );
         }
         assert_eq!(ask(&gate, &[]), Some(400));
+        // The first line of a request may name a host as well.
+        let own = [(HOST, "localhost")];
+        assert_eq!(ask_for(&gate, Some("evil.example"), &own), Some(421));
+        assert_eq!(ask_for(&gate, Some("localhost"), &own), None);
         let two = [(HOST, "localhost"), (HOST, "evil.example")];
         assert_eq!(ask(&gate, &two), Some(400));
-        assert!(gate.refuse(Version::HTTP_10, &HeaderMap::new()).is_none());
+        assert!(
+            gate.refuse(Version::HTTP_10, None, &HeaderMap::new())
+                .is_none()
+        );
     }
 
     #[test]
