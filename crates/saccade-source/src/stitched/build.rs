@@ -192,7 +192,7 @@ impl Builder {
     pub(super) fn description(&self, place: Place, plan: &Plan) -> String {
         let (volume, rules) = (&self.volume, self.rules);
         let (sections, near) = (&plan.sections, &plan.near);
-        format!("block 2 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
+        format!("block 3 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
     }
 
     /// Builds a block, as planned if it was.

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::build::{Part, Rules};
 use super::coverage::{Grid, Overlaps, Segment};
 use super::error::StitchError;
-use super::resample::{Patch, Sample, averaged, most_frequent};
+use super::resample::{Kept, Patch, Sample, averaged, fine_number, most_frequent};
 use super::tiles::{Fetched, Tiles};
 
 /// Samples of a row of a level from one line's beginning to the next. Blocks begin there as well.
@@ -44,32 +44,41 @@ fn pieces(grid: &Grid, segment: Segment) -> impl Iterator<Item = Piece> + use<> 
 }
 
 /// Samples of a grid, `by` x `by` of each voxel, 0 where nothing is drawn yet.
-pub(super) struct Canvas<S> {
+pub(super) struct Canvas<S: Sample> {
     grid: Grid,
     by: u32,
     rules: Rules,
-    values: Vec<S>,
-    /// Of labels of which several make a voxel: where a tile is, also one that has 0 there.
-    there: Vec<bool>,
+    samples: Samples<S>,
+}
+
+/// Rounded only where nothing is done with them after, so that voxels are rounded once.
+enum Samples<S: Sample> {
+    /// Each is a voxel.
+    Voxels(Vec<S>),
+    /// Several make a voxel.
+    Fine(Vec<S::Fine>),
+    /// Several labels make a voxel: these, and where a tile is, also one that has 0 there.
+    Votes(Vec<S>, Vec<bool>),
     /// Where tiles are blended: sums of weighted values, and of weights.
-    sums: Vec<(f32, f32)>,
+    Sums(Vec<(f32, f32)>),
 }
 
 impl<S: Sample> Canvas<S> {
     pub(super) fn new(grid: Grid, by: u32, rules: Rules) -> Self {
         let samples = grid.size.as_usizevec2().element_product();
-        let votes = rules.labels && by > 1;
-        let (values, sums) = match rules.overlaps {
-            Overlaps::NearestCentre => (vec![S::default(); samples], Vec::new()),
-            Overlaps::Blend => (Vec::new(), vec![(0.0, 0.0); samples]),
+        let samples = match (rules.overlaps, by) {
+            (Overlaps::Blend, _) => Samples::Sums(vec![(0.0, 0.0); samples]),
+            (Overlaps::NearestCentre, 1) => Samples::Voxels(vec![S::default(); samples]),
+            (Overlaps::NearestCentre, _) if rules.labels => {
+                Samples::Votes(vec![S::default(); samples], vec![false; samples])
+            }
+            (Overlaps::NearestCentre, _) => Samples::Fine(vec![S::Fine::default(); samples]),
         };
         Self {
             grid,
             by,
             rules,
-            values,
-            there: vec![false; if votes { samples } else { 0 }],
-            sums,
+            samples,
         }
     }
 
@@ -101,57 +110,72 @@ impl<S: Sample> Canvas<S> {
             let begin = segment.y as usize * grid.size.x as usize;
             let place = begin + segment.start as usize..begin + segment.end as usize;
             let line = (candidate.pixel_at(&grid, first), along);
-            if self.rules.labels {
-                if let Some(there) = self.there.get_mut(place.clone()) {
-                    there.fill(true);
+            match &mut self.samples {
+                Samples::Voxels(values) if self.rules.labels => {
+                    patch.labels_from(line, skip, &mut values[place]);
                 }
-                patch.labels_from(line, skip, &mut self.values[place]);
-            } else if self.rules.overlaps == Overlaps::NearestCentre {
-                patch.sample_from(interpolation, line, skip, &mut self.values[place]);
-            } else {
-                row.resize(place.len(), S::default());
-                patch.sample_from(interpolation, line, skip, &mut row);
-                self.add(part, segment, &row);
+                Samples::Votes(values, there) => {
+                    there[place.clone()].fill(true);
+                    patch.labels_from(line, skip, &mut values[place]);
+                }
+                Samples::Voxels(values) => {
+                    patch.sample_from(interpolation, line, skip, &mut values[place]);
+                }
+                Samples::Fine(values) => {
+                    patch.sample_from(interpolation, line, skip, &mut values[place]);
+                }
+                Samples::Sums(sums) => {
+                    row.resize(place.len(), S::Fine::default());
+                    patch.sample_from(interpolation, line, skip, &mut row);
+                    add::<S>(&mut sums[place], &grid, part, segment, &row);
+                }
             }
         }
         Ok(())
     }
 
-    /// Adds a segment's values to the sums.
-    fn add(&mut self, part: &Part, segment: Segment, values: &[S]) {
-        let candidate = &part.candidate;
-        let first = segment.y as usize * self.grid.size.x as usize;
-        let sums = &mut self.sums[first + segment.start as usize..first + segment.end as usize];
-        for ((x, value), (sum, weights)) in (segment.start..).zip(values).zip(sums) {
-            let position = candidate.tile.position(self.grid.point(x, segment.y));
-            #[expect(
-                clippy::cast_possible_truncation,
-                reason = "a weight of seven digits is good enough for values of five"
-            )]
-            let weight = candidate.weight(position) as f32;
-            *sum += weight * value.number();
-            *weights += weight;
-        }
-    }
-
     /// The voxels.
     pub(super) fn finish(self) -> Vec<S> {
-        let size = self.grid.size / self.by;
-        let samples = match self.rules.overlaps {
-            Overlaps::NearestCentre => self.values,
-            Overlaps::Blend => {
-                let mean = |(sum, weights): (f32, f32)| match weights {
-                    0.0 => S::default(),
-                    _ => S::rounded(sum / weights),
-                };
-                self.sums.into_iter().map(mean).collect()
+        let (size, by) = (self.grid.size / self.by, self.by);
+        match self.samples {
+            Samples::Voxels(voxels) => voxels,
+            Samples::Fine(values) => averaged(&values, size, by),
+            Samples::Votes(values, there) => most_frequent(&values, &there, size, by),
+            Samples::Sums(sums) if by == 1 => sums.into_iter().map(blended).collect(),
+            Samples::Sums(sums) => {
+                let values: Vec<S::Fine> = sums.into_iter().map(blended::<S, _>).collect();
+                averaged(&values, size, by)
             }
-        };
-        match self.by {
-            1 => samples,
-            by if self.rules.labels => most_frequent(&samples, &self.there, size, by),
-            by => averaged(&samples, size, by),
         }
+    }
+}
+
+/// Adds a segment's values to its sums.
+fn add<S: Sample>(
+    sums: &mut [(f32, f32)],
+    grid: &Grid,
+    part: &Part,
+    segment: Segment,
+    values: &[S::Fine],
+) {
+    let candidate = &part.candidate;
+    for ((x, value), (sum, weights)) in (segment.start..).zip(values).zip(sums) {
+        let position = candidate.tile.position(grid.point(x, segment.y));
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "a weight of seven digits is good enough for values of five"
+        )]
+        let weight = candidate.weight(position) as f32;
+        *sum += weight * fine_number(*value);
+        *weights += weight;
+    }
+}
+
+/// What tiles that are blended give together.
+fn blended<S: Sample, K: Kept<S>>((sum, weights): (f32, f32)) -> K {
+    match weights {
+        0.0 => K::default(),
+        _ => K::of_number(sum / weights),
     }
 }
 

@@ -14,6 +14,8 @@ use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE};
 pub(super) use coarse::{averaged, most_frequent};
 use line::{Line, MARGIN};
 pub use sample::Sample;
+pub(super) use sample::fine_number;
+pub(super) use sample::sealed::Kept;
 
 /// What a sample that lies between pixels is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -154,12 +156,12 @@ impl<S: Sample> Patch<S> {
 
     /// The same without the first `skip` samples, which may lie anywhere. The others are what they are with them, to the last
     /// bit.
-    pub(super) fn sample_from(
+    pub(super) fn sample_from<K: Kept<S>>(
         &self,
         interpolation: Interpolation,
         line: (DVec2, DVec2),
         skip: usize,
-        out: &mut [S],
+        out: &mut [K],
     ) {
         let mut line = self.line(line);
         if interpolation != Interpolation::Linear {
@@ -170,7 +172,7 @@ impl<S: Sample> Patch<S> {
                 float::nearest(&self.values, self.width, line, S::of(1), out);
             }
             Interpolation::Cubic => float::cubic(&self.values, self.width, line, out),
-            Interpolation::Linear => S::interpolate(&self.values, self.width, line, skip, out),
+            Interpolation::Linear => K::interpolate(&self.values, self.width, line, skip, out),
         }
     }
 
@@ -275,8 +277,8 @@ mod tests {
             let skip = skip % whole;
             let end = (skip + length).min(whole);
             let line = patch.line((start, along));
-            let mut all = [vec![0; whole], vec![0; whole], vec![0; whole]];
-            let mut part = [vec![0; end - skip], vec![0; end - skip], vec![0; end - skip]];
+            let mut all = [vec![0_u8; whole], vec![0; whole], vec![0; whole]];
+            let mut part = [vec![0_u8; end - skip], vec![0; end - skip], vec![0; end - skip]];
             for (out, skip) in [(&mut all, 0), (&mut part, skip)] {
                 line::interpolate(&patch.values, patch.width, line, skip, &mut out[0]);
                 line::gathered(&patch.values, patch.width, line, skip, &mut out[1]);
@@ -331,6 +333,15 @@ mod tests {
                 // Half a level of it is the last rounding.
                 prop_assert!(off < 1.5, "sample {} is {}, not {}", n, got, want);
                 prop_assert!(got.abs_diff(want.round() as u8) <= 1);
+            }
+            // Finely, it is what the other was rounded from; half a level is of the weights' eight bits.
+            let mut fine = vec![0_u16; length];
+            patch.sample_from(Interpolation::Linear, (start, along), 0, &mut fine);
+            for (n, (fine, got)) in fine.iter().zip(&out).enumerate() {
+                prop_assert_eq!(((fine + 128) >> 8) as u8, *got);
+                let want = exact(&value, start + along * n as f64).max(1.0);
+                let off = (f64::from(*fine) / 256.0 - want).abs();
+                prop_assert!(off < 0.6, "sample {} is {}, not {}", n, fine, want);
             }
         }
     }

@@ -3,9 +3,11 @@
 use glam::UVec2;
 
 use super::Sample;
+use super::sample::FINE_BITS;
 
-/// Each `by` x `by` values become one: the mean of those that are not 0.
-pub(in crate::stitched) fn averaged<S: Sample>(values: &[S], size: UVec2, by: u32) -> Vec<S> {
+/// Each `by` x `by` values become one, `by` up to 16: the mean of those that are not 0, which is rounded
+/// nowhere before.
+pub(in crate::stitched) fn averaged<S: Sample>(values: &[S::Fine], size: UVec2, by: u32) -> Vec<S> {
     let (width, by) = (size.x as usize * by as usize, by as usize);
     let mut averaged = Vec::with_capacity(size.x as usize * size.y as usize);
     let mut sums = vec![(0_u32, 0_u32); size.x as usize];
@@ -13,13 +15,17 @@ pub(in crate::stitched) fn averaged<S: Sample>(values: &[S], size: UVec2, by: u3
         sums.fill((0, 0));
         for row in rows.chunks_exact(width) {
             for (values, (sum, count)) in row.chunks_exact(by).zip(&mut sums) {
-                *sum += values.iter().map(|v| u32::from((*v).into())).sum::<u32>();
-                let there = values.iter().filter(|v| **v != S::default());
+                // 256 of at most (2^16 - 1) * 2^8 each: less than 2^32.
+                *sum += values.iter().map(|v| (*v).into()).sum::<u32>();
+                let there = values.iter().filter(|v| **v != S::Fine::default());
                 *count += u32::try_from(there.count()).unwrap_or(0);
             }
         }
         averaged.extend(sums.iter().map(|(sum, count)| {
-            let mean = (sum + count / 2).checked_div(*count).unwrap_or(0);
+            let whole = u64::from(*count) << FINE_BITS;
+            let mean = (u64::from(*sum) + whole / 2)
+                .checked_div(whole)
+                .unwrap_or(0);
             S::of(u16::try_from(mean).expect("a mean of 16-bit values has 16 bits"))
         }));
     }
@@ -76,8 +82,20 @@ mod tests {
     #[test]
     fn means_leave_out_what_is_not_there() {
         let values = [1, 2, 0, 0, 4, 6, 0, 9, 0, 0, 255, 255, 0, 0, 255, 254];
-        assert_eq!(averaged::<u8>(&values, UVec2::new(2, 2), 2), [3, 9, 0, 255]);
-        assert_eq!(averaged(&values, UVec2::new(4, 4), 1), values);
+        let fine = values.map(|value| value << 8);
+        assert_eq!(averaged::<u8>(&fine, UVec2::new(2, 2), 2), [3, 9, 0, 255]);
+        let whole = averaged::<u8>(&fine, UVec2::new(4, 4), 1);
+        assert!(whole.into_iter().map(u16::from).eq(values));
+    }
+
+    #[test]
+    fn means_are_rounded_once() {
+        // Of 10.498 and 11.498, and of 10.502 and 11.502: rounded first, both pairs are alike.
+        let size = UVec2::new(1, 1);
+        assert_eq!(averaged::<u8>(&[2688, 2688, 2943, 2943], size, 2), [11]);
+        assert_eq!(averaged::<u8>(&[2687, 2687, 2687, 2688], size, 2), [10]);
+        let largest = vec![u32::from(u16::MAX) << 8; 256];
+        assert_eq!(averaged::<u16>(&largest, size, 16), [u16::MAX]);
     }
 
     #[test]

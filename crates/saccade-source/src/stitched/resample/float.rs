@@ -5,7 +5,7 @@
 //! a hundredth of a grey level.
 
 use super::line::Line;
-use super::sample::sealed::Arithmetic;
+use super::sample::sealed::{Arithmetic, Kept};
 
 /// Samples that are interpolated at once.
 const LANES: usize = 8;
@@ -42,7 +42,12 @@ fn lerp(a: f32, b: f32, weight: f32) -> f32 {
 }
 
 /// As [`super::line::interpolate`].
-pub(super) fn linear<S: Arithmetic>(values: &[S], width: usize, mut line: Line, out: &mut [S]) {
+pub(super) fn linear<S: Arithmetic, K: Kept<S>>(
+    values: &[S],
+    width: usize,
+    mut line: Line,
+    out: &mut [K],
+) {
     for out in out.chunks_mut(LANES) {
         let places = Places::of(&mut line, width, out.len());
         let mut corners = [[0.0_f32; LANES]; 4];
@@ -56,7 +61,7 @@ pub(super) fn linear<S: Arithmetic>(values: &[S], width: usize, mut line: Line, 
         let [a, b, c, d] = corners;
         for (n, out) in out.iter_mut().enumerate() {
             let (x, y) = (places.x[n], places.y[n]);
-            *out = S::rounded(lerp(lerp(a[n], b[n], x), lerp(c[n], d[n], x), y));
+            *out = K::of_number(lerp(lerp(a[n], b[n], x), lerp(c[n], d[n], x), y));
         }
     }
 }
@@ -75,7 +80,12 @@ fn catmull_rom(t: f32) -> [f32; 4] {
 }
 
 /// Along cubic curves. Around each sample, two pixels in each direction must be there.
-pub(super) fn cubic<S: Arithmetic>(values: &[S], width: usize, mut line: Line, out: &mut [S]) {
+pub(super) fn cubic<S: Arithmetic, K: Kept<S>>(
+    values: &[S],
+    width: usize,
+    mut line: Line,
+    out: &mut [K],
+) {
     for out in out.chunks_mut(LANES) {
         let places = Places::of(&mut line, width, out.len());
         for (n, out) in out.iter_mut().enumerate() {
@@ -89,22 +99,22 @@ pub(super) fn cubic<S: Arithmetic>(values: &[S], width: usize, mut line: Line, o
                 let across = p * a.number() + q * b.number() + r * c.number() + s * d.number();
                 sum += weight * across;
             }
-            *out = S::rounded(sum);
+            *out = K::of_number(sum);
         }
     }
 }
 
 /// The pixels that samples lie in, `least` in place of smaller ones.
-pub(super) fn nearest<S: Arithmetic>(
+pub(super) fn nearest<S: Arithmetic, K: Kept<S>>(
     values: &[S],
     width: usize,
     mut line: Line,
     least: S,
-    out: &mut [S],
+    out: &mut [K],
 ) {
     for out in out {
         let [x, y] = line.weights().map(|w| usize::from(w >= 1 << 15));
-        *out = values[line.pixel(width) + y * width + x].max(least);
+        *out = K::of_pixel(values[line.pixel(width) + y * width + x].max(least));
         line.step(1);
     }
 }

@@ -132,16 +132,37 @@ fn until_it_leaves(from: u16, slope: i64) -> usize {
     samples.map_or(usize::MAX, |samples| samples as usize + 1)
 }
 
-/// Interpolates between an upper and a lower pair. Nothing measured is 0.
+/// What becomes of an interpolated value, which has 8 bits after the point. Nothing measured is 0.
+pub(super) trait OfSum: Default + bytemuck::Pod {
+    fn of_sum(sum: u16) -> Self;
+}
+
+/// Rounded.
+impl OfSum for u8 {
+    #[inline(always)]
+    fn of_sum(sum: u16) -> Self {
+        ((sum.wrapping_add(128) >> 8) as Self).max(1)
+    }
+}
+
+/// As it is.
+impl OfSum for u16 {
+    #[inline(always)]
+    fn of_sum(sum: u16) -> Self {
+        sum.max(1 << 8)
+    }
+}
+
+/// Interpolates between an upper and a lower pair, 8 bits after the point.
 #[inline(always)]
-fn lerp(top: [u8; 2], bottom: [u8; 2], wx: u16, wy: u16) -> u8 {
+fn lerp(top: [u8; 2], bottom: [u8; 2], wx: u16, wy: u16) -> u16 {
     let right = ((wx >> 1) + 64) >> 7;
     lerp_at(top, bottom, right, wy)
 }
 
 /// The same with a weight of 0 to 256 along x.
 #[inline(always)]
-fn lerp_at(top: [u8; 2], bottom: [u8; 2], right: u16, wy: u16) -> u8 {
+fn lerp_at(top: [u8; 2], bottom: [u8; 2], right: u16, wy: u16) -> u16 {
     // 8 bits before and 8 bits after the point: no sum here reaches 2^16.
     let left = 256 - right;
     let along = |pair: [u8; 2]| {
@@ -150,18 +171,17 @@ fn lerp_at(top: [u8; 2], bottom: [u8; 2], right: u16, wy: u16) -> u8 {
     };
     let part = |v: u16| ((u32::from(v) * u32::from(wy)) >> 16) as u16;
     let (top, bottom) = (along(top), along(bottom));
-    let sum = top.wrapping_sub(part(top)).wrapping_add(part(bottom));
-    ((sum.wrapping_add(128) >> 8) as u8).max(1)
+    top.wrapping_sub(part(top)).wrapping_add(part(bottom))
 }
 
 /// Interpolates in an image, `width` pixels wide, with [`MARGIN`] bytes behind its end: sample `skip` of a line, and those
 /// after it. All of these must lie between its pixels.
-pub(super) fn interpolate(
+pub(super) fn interpolate<K: OfSum>(
     values: &[u8],
     width: usize,
     mut line: Line,
     skip: usize,
-    out: &mut [u8],
+    out: &mut [K],
 ) {
     let one = 1_i64 << BITS;
     if line.is_straight() {
@@ -194,29 +214,29 @@ pub(super) fn interpolate(
 }
 
 /// All samples have the same weights.
-fn shifted(values: &[u8], width: usize, line: Line, out: &mut [u8]) {
+fn shifted<K: OfSum>(values: &[u8], width: usize, line: Line, out: &mut [K]) {
     let (at, [wx, wy]) = (line.pixel(width), line.weights());
     let row = |from: usize| values[from..from + out.len()].iter();
     let right = ((wx >> 1) + 64) >> 7;
     let top = row(at).zip(row(at + 1));
     if wy == 0 && right == 0 {
         for (out, (value, _)) in out.iter_mut().zip(top) {
-            *out = (*value).max(1);
+            *out = K::of_sum(u16::from(*value) << 8);
         }
     } else {
         let bottom = row(at + width).zip(row(at + width + 1));
         for (out, ((a, b), (c, d))) in out.iter_mut().zip(top.zip(bottom)) {
-            *out = lerp_at([*a, *b], [*c, *d], right, wy);
+            *out = K::of_sum(lerp_at([*a, *b], [*c, *d], right, wy));
         }
     }
 }
 
-pub(super) fn in_runs(
+pub(super) fn in_runs<K: OfSum>(
     values: &[u8],
     width: usize,
     mut line: Line,
     mut skip: usize,
-    out: &mut [u8],
+    out: &mut [K],
 ) {
     let slopes = [rounded(line.dx - (1 << BITS)), rounded(line.dy)];
     let ramps = slopes.map(ramp);
@@ -244,7 +264,7 @@ pub(super) fn in_runs(
             if let Some(to) = out[done..].first_chunk_mut() {
                 lerp_run(pixels, weights, &ramps, to);
             } else {
-                let mut last = [0; LANES];
+                let mut last = [K::default(); LANES];
                 lerp_run(pixels, weights, &ramps, &mut last);
                 let to = &mut out[done..];
                 to.copy_from_slice(&last[..to.len()]);
@@ -259,25 +279,25 @@ pub(super) fn in_runs(
 
 /// Not inlined: what is known of the arguments outside makes the compiler shuffle lanes.
 #[inline(never)]
-fn lerp_run(
+fn lerp_run<K: OfSum>(
     pixels: [&Lanes<u8>; 4],
     weights: [u16; 2],
     ramps: &[Lanes<u16>; 2],
-    out: &mut Lanes<u8>,
+    out: &mut Lanes<K>,
 ) {
     let [a, b, c, d] = pixels;
     for (n, out) in out.iter_mut().enumerate() {
         let [wx, wy] = [0, 1].map(|axis| ramps[axis][n].wrapping_add(weights[axis]));
-        *out = lerp([a[n], b[n]], [c[n], d[n]], wx, wy);
+        *out = K::of_sum(lerp([a[n], b[n]], [c[n], d[n]], wx, wy));
     }
 }
 
-pub(super) fn gathered(
+pub(super) fn gathered<K: OfSum>(
     values: &[u8],
     width: usize,
     mut line: Line,
     skip: usize,
-    mut out: &mut [u8],
+    mut out: &mut [K],
 ) {
     let mut lead = skip % LANES;
     line.step(skip - lead);
@@ -290,7 +310,7 @@ pub(super) fn gathered(
 }
 
 /// Lanes `lead` and following of the group that a line begins with.
-fn group(values: &[u8], width: usize, line: Line, lead: usize, out: &mut [u8]) {
+fn group<K: OfSum>(values: &[u8], width: usize, line: Line, lead: usize, out: &mut [K]) {
     // Of 16 bits after the point, so that pixels and the lanes' weights agree; anew for each group.
     let (dx, dy) = (rounded(line.dx), rounded(line.dy));
     let ramps = [dx, dy].map(ramp);
@@ -313,21 +333,22 @@ fn group(values: &[u8], width: usize, line: Line, lead: usize, out: &mut [u8]) {
     if let Some(to) = out.as_mut_array() {
         lerp_pairs(&pairs, weights, &ramps, to);
     } else {
-        let mut whole = [0; LANES];
+        let mut whole = [K::default(); LANES];
         lerp_pairs(&pairs, weights, &ramps, &mut whole);
         out.copy_from_slice(&whole[lanes]);
     }
 }
 
 #[inline(never)]
-fn lerp_pairs(
+fn lerp_pairs<K: OfSum>(
     [top, bottom]: &[Lanes<u16>; 2],
     weights: [u16; 2],
     ramps: &[Lanes<u16>; 2],
-    out: &mut Lanes<u8>,
+    out: &mut Lanes<K>,
 ) {
     for (n, out) in out.iter_mut().enumerate() {
         let [wx, wy] = [0, 1].map(|axis| ramps[axis][n].wrapping_add(weights[axis]));
-        *out = lerp(top[n].to_le_bytes(), bottom[n].to_le_bytes(), wx, wy);
+        let sum = lerp(top[n].to_le_bytes(), bottom[n].to_le_bytes(), wx, wy);
+        *out = K::of_sum(sum);
     }
 }

@@ -10,7 +10,7 @@
 
 use std::arch::x86_64::*;
 
-use super::line::{Line, MARGIN, rounded};
+use super::line::{Line, MARGIN, OfSum, rounded};
 
 /// Samples at once.
 const LANES: usize = 16;
@@ -29,7 +29,12 @@ pub(super) fn serves(values: &[u8], line: Line) -> bool {
 
 /// Interpolates as many whole groups of samples as there are, see [`super::line::interpolate`]; returns how many samples:
 /// none where [`serves`] says so.
-pub(super) fn interpolate(values: &[u8], width: usize, line: Line, out: &mut [u8]) -> usize {
+pub(super) fn interpolate<K: OfSum>(
+    values: &[u8],
+    width: usize,
+    line: Line,
+    out: &mut [K],
+) -> usize {
     let whole = out.len() / LANES * LANES;
     let (dx, dy) = (rounded(line.dx), rounded(line.dy));
     if whole == 0 || !serves(values, line) {
@@ -116,9 +121,9 @@ fn in_order(packed: __m256i) -> __m256i {
     _mm256_permute4x64_epi64::<0b11_01_10_00>(packed)
 }
 
-/// [`super::line`]'s interpolation between pairs of neighbours, the left one in the low byte.
+/// [`super::line`]'s interpolation between pairs of neighbours, the left one in the low byte: 8 bits after the point.
 #[target_feature(enable = "avx2")]
-fn lerp(top: __m256i, bottom: __m256i, wx: __m256i, wy: __m256i) -> [u8; LANES] {
+fn lerp(top: __m256i, bottom: __m256i, wx: __m256i, wy: __m256i) -> __m256i {
     let rounded = _mm256_add_epi16(_mm256_srli_epi16::<1>(wx), _mm256_set1_epi16(64));
     let right = _mm256_srli_epi16::<7>(rounded);
     let left = _mm256_sub_epi16(_mm256_set1_epi16(256), right);
@@ -129,11 +134,23 @@ fn lerp(top: __m256i, bottom: __m256i, wx: __m256i, wy: __m256i) -> [u8; LANES] 
     };
     let (top, bottom) = (along(top), along(bottom));
     let upper = _mm256_sub_epi16(top, _mm256_mulhi_epu16(top, wy));
-    let sum = _mm256_add_epi16(upper, _mm256_mulhi_epu16(bottom, wy));
-    let sum = _mm256_srli_epi16::<8>(_mm256_add_epi16(sum, _mm256_set1_epi16(128)));
-    let sum = _mm256_max_epi16(sum, _mm256_set1_epi16(1));
-    let packed = _mm256_permute4x64_epi64::<0b10_00>(_mm256_packus_epi16(sum, sum));
-    bytemuck::cast(_mm256_castsi256_si128(packed))
+    _mm256_add_epi16(upper, _mm256_mulhi_epu16(bottom, wy))
+}
+
+/// [`OfSum::of_sum`] of 16.
+#[target_feature(enable = "avx2")]
+fn keep<K: OfSum>(sums: __m256i, out: &mut [K]) {
+    if size_of::<K>() == size_of::<u8>() {
+        let rounded = _mm256_srli_epi16::<8>(_mm256_add_epi16(sums, _mm256_set1_epi16(128)));
+        let rounded = _mm256_max_epi16(rounded, _mm256_set1_epi16(1));
+        let packed = _mm256_packus_epi16(rounded, rounded);
+        let packed = _mm256_castsi256_si128(_mm256_permute4x64_epi64::<0b10_00>(packed));
+        let rounded: [u8; LANES] = bytemuck::cast(packed);
+        bytemuck::cast_slice_mut(out).copy_from_slice(&rounded);
+    } else {
+        let sums: [u16; LANES] = bytemuck::cast(_mm256_max_epu16(sums, _mm256_set1_epi16(1 << 8)));
+        bytemuck::cast_slice_mut(out).copy_from_slice(&sums);
+    }
 }
 
 /// A step in lanes of 32 bits.
@@ -142,7 +159,7 @@ fn narrow(step: i64) -> i32 {
 }
 
 #[target_feature(enable = "avx2")]
-fn by_rows(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
+fn by_rows<K: OfSum>(values: &[u8], width: usize, mut line: Line, out: &mut [K]) {
     let (dx, dy) = (narrow(line.dx), narrow(line.dy));
     let steps = Steps::new(dx, dy);
     let one = _mm256_set1_epi16(1);
@@ -179,13 +196,13 @@ fn by_rows(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
             upper = lower;
             number = _mm256_add_epi16(number, one);
         }
-        *out = lerp(top, bottom, weights(places.x), weights(places.y));
+        keep(lerp(top, bottom, weights(places.x), weights(places.y)), out);
         line.step(LANES);
     }
 }
 
 #[target_feature(enable = "avx2")]
-fn one_by_one(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
+fn one_by_one<K: OfSum>(values: &[u8], width: usize, mut line: Line, out: &mut [K]) {
     let steps = Steps::new(narrow(line.dx), narrow(line.dy));
     let stride = _mm256_set1_epi32(i32::try_from(width).expect("rows are shorter than images"));
     let lower = &values[width..];
@@ -209,7 +226,7 @@ fn one_by_one(values: &[u8], width: usize, mut line: Line, out: &mut [u8]) {
             }
         }
         let [top, bottom] = pairs.map(bytemuck::cast::<_, __m256i>);
-        *out = lerp(top, bottom, weights(places.x), weights(places.y));
+        keep(lerp(top, bottom, weights(places.x), weights(places.y)), out);
         line.step(LANES);
     }
 }
@@ -261,12 +278,16 @@ mod tests {
             };
             let length = (0..200).take_while(inside).count();
             let line = Line::new(start, DVec2::ZERO, along);
-            let (mut wide, mut narrow) = (vec![0; length], vec![0; length]);
+            let (mut wide, mut narrow) = (vec![0_u8; length], vec![0_u8; length]);
+            let (mut fine, mut fine_narrow) = (vec![0_u16; length], vec![0_u16; length]);
             let done = interpolate(&values, 190, line, &mut wide);
             gathered(&values, 190, line, 0, &mut narrow);
             let has = is_x86_feature_detected!("avx2");
             prop_assert_eq!(done, if has { length / LANES * LANES } else { 0 });
             prop_assert_eq!(&wide[..done], &narrow[..done]);
+            prop_assert_eq!(done, interpolate(&values, 190, line, &mut fine));
+            gathered(&values, 190, line, 0, &mut fine_narrow);
+            prop_assert_eq!(&fine[..done], &fine_narrow[..done]);
             // The comparison can fail: a pixel further all is different.
             if done > 0 {
                 let mut other = vec![0; length];
