@@ -235,7 +235,7 @@ fn cut(stack: &dyn Stack, mpix_per_s: &mut Vec<f64>) -> Result<u64> {
         rate_mpixel_s: None,
         ..SimulateConfig::default()
     };
-    let (clock, cancel) = (SystemClock::default(), Cancel::new());
+    let (clock, cancel) = (SystemClock, Cancel::new());
     let start = Stopwatch::start();
     let done = simulate::run(&config, stack, folder.path(), &clock, &cancel, &())?;
     mpix_per_s.push(done.pixels as f64 / 1e6 / start.elapsed().as_secs_f64());

@@ -26,7 +26,6 @@
 //! each record by one of them, and tell from time to time that they live. What a dead one had claimed
 //! is free again when its lease is over. See [`Catalog::claim`].
 
-mod clock;
 mod commit;
 mod database;
 mod entries;
@@ -46,15 +45,14 @@ mod workers;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
-use std::time::SystemTime;
 
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Volume, check_name};
 use tokio::sync::watch;
 
+use crate::clock::{Clock, SystemClock};
 use database::{Database, Durability, Row, Statement, Transaction, Value};
 
-pub use clock::{Clock, SystemClock};
 pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
 pub use entries::{
     CatalogChange, ChangeReason, NewTile, Quarantined, Retired, Statistics, Tile, TileId,
@@ -160,7 +158,7 @@ impl Catalog {
         &self.inner.location
     }
 
-    /// Measures leases with this clock instead of the machine's or, with a server, the server's. Has
+    /// Measures time by this clock instead of the machine's and leases, with a server, the server's. Has
     /// an effect once.
     #[must_use]
     pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
@@ -190,6 +188,14 @@ impl Catalog {
             }
             there => there?,
         };
+    /// The clock by which times are noted; those who work with the catalog wait and measure by it, too.
+    pub fn clock(&self) -> &dyn Clock {
+        match self.inner.clock.get() {
+            Some(clock) => &**clock,
+            None => &SystemClock,
+        }
+    }
+
         let differs = |what, existing: String, asked: String| {
             let same = existing == asked;
             let name = volume.name.clone();
@@ -355,7 +361,7 @@ impl Catalog {
         tile: &NewTile,
     ) -> Result<TileOutcome, CatalogError> {
         let mut commit = self.begin(volume).await?;
-        let outcome = commit.tile(tile, SystemTime::now()).await?;
+        let outcome = commit.tile(tile, self.clock().now()).await?;
         commit.finish().await?;
         Ok(outcome)
     }
@@ -389,7 +395,7 @@ impl Catalog {
         position: u64,
     ) -> Result<DeleteOutcome, CatalogError> {
         let mut commit = self.begin(volume).await?;
-        let outcome = commit.delete(tile, position, SystemTime::now()).await?;
+        let outcome = commit.delete(tile, position, self.clock().now()).await?;
         commit.finish().await?;
         Ok(outcome)
     }

@@ -4,9 +4,9 @@
 //! nothing: what it enters meanwhile is named by then, and what it is about to enter is young.
 
 use std::collections::HashSet;
-use std::hash::{BuildHasher, RandomState};
+use std::hash::BuildHasher as _;
 use std::path::PathBuf;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use bytes::Bytes;
 use futures::{StreamExt as _, stream};
@@ -15,6 +15,7 @@ use crate::VisualizationArchive;
 use crate::acquisition::Cursor;
 use crate::catalog::{CatalogError, Tile, VolumeEntry, place};
 use crate::pyramid::{self, PyramidError, Verified};
+use crate::randomness::Keyed;
 use crate::storage::StorageError;
 
 mod misplaced;
@@ -111,7 +112,7 @@ pub async fn check(
         progress,
         total,
         report: CheckReport::default(),
-        hasher: RandomState::new(),
+        hasher: Keyed::new(archive.randomness()),
         named: HashSet::new(),
         shared: HashSet::new(),
         given_back: HashSet::new(),
@@ -147,7 +148,7 @@ struct Check<'a> {
     progress: &'a (dyn Fn(u64, u64) + Sync),
     total: u64,
     report: CheckReport,
-    hasher: RandomState,
+    hasher: Keyed,
     /// Hashes of the names that the catalog knows: millions of names would take much memory.
     named: HashSet<u64>,
     /// Pyramids of which it was found that several tiles name them.
@@ -235,7 +236,7 @@ impl Check<'_> {
             self.find(FindingKind::Miscounted, entry, None, reason);
             self.miscounted.push((volume.name.clone(), number));
         }
-        let later = SystemTime::now() + Duration::from_secs(1 << 32);
+        let later = catalog.clock().now() + Duration::from_secs(1 << 32);
         for retired in catalog.retired(&volume.name, later, u32::MAX).await? {
             self.report.retired += 1;
             if !self.named.insert(self.hasher.hash_one(&retired.pyramid)) {

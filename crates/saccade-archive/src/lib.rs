@@ -31,11 +31,21 @@
 //! It does not decide when anything is processed, move pixels between tiles, or know of a third
 //! dimension beyond the sections' numbers. It does not run in browsers.
 
+#![cfg_attr(
+    test,
+    allow(
+        clippy::disallowed_methods,
+        reason = "tests also wait for what really happens"
+    )
+)]
+
 pub mod acquisition;
 pub mod catalog;
 pub mod check;
+pub mod clock;
 pub mod image;
 pub mod pyramid;
+pub mod randomness;
 pub mod storage;
 pub mod tls;
 mod visualization;

@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::catalog::{Catalog, CatalogError, CatalogLocation};
+use crate::randomness::{Randomness, SystemRandomness};
 use crate::storage::{LocalStorage, MemoryStorage, Storage, StorageError};
 
 pub use identity::{IDENTITY, read_identity};
@@ -18,6 +19,7 @@ pub use location::{ArchiveLocation, LocationError, StorageLocation};
 pub struct VisualizationArchive {
     catalog: Catalog,
     storage: Arc<dyn Storage>,
+    randomness: Arc<dyn Randomness>,
 }
 
 /// Why a visualization archive could not be opened.
@@ -169,22 +171,50 @@ impl VisualizationArchive {
                 (catalog, storage)
             }
         };
+        let archive = Self::from_parts(catalog, storage);
         if create {
-            identity::make(&catalog, &*storage, location).await?;
+            archive.identify(location).await?;
         } else {
-            identity::check(&catalog, &*storage, location).await?;
+            identity::check(&archive.catalog, &*archive.storage, location).await?;
         }
-        Ok(Self { catalog, storage })
+        Ok(archive)
     }
 
     /// An archive of these parts.
     pub fn from_parts(catalog: Catalog, storage: Arc<dyn Storage>) -> Self {
-        Self { catalog, storage }
+        let randomness = Arc::new(SystemRandomness);
+        Self {
+            catalog,
+            storage,
+            randomness,
+        }
+    }
+
+    /// Draws from this instead of the machine's randomness.
+    #[must_use]
+    pub fn with_randomness(self, randomness: Arc<dyn Randomness>) -> Self {
+        Self { randomness, ..self }
+    }
+
+    /// Gives the parts an [`IDENTITY`] by which they are known to belong together, if they have none. Messages call
+    /// them by `location`.
+    ///
+    /// # Errors
+    ///
+    /// [`ArchiveError`], if they are known not to belong together, or not to be usable.
+    pub async fn identify(&self, location: &ArchiveLocation) -> Result<(), ArchiveError> {
+        let (catalog, storage) = (&self.catalog, &*self.storage);
+        identity::make(catalog, storage, location, &*self.randomness).await
     }
 
     /// Which tiles there are.
     pub fn catalog(&self) -> &Catalog {
         &self.catalog
+    }
+
+    /// What is drawn from, where nobody is to foresee it.
+    pub(crate) fn randomness(&self) -> &dyn Randomness {
+        &*self.randomness
     }
 
     /// Their pyramids.

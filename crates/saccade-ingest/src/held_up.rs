@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
+use saccade_archive::clock::Clock;
+
 use crate::progress::{Progress, State};
 
 /// Who is held up.
@@ -30,14 +32,14 @@ pub struct Reason {
 pub struct HeldUp(Arc<Mutex<BTreeMap<Part, Reason>>>);
 
 impl HeldUp {
-    /// A part waits, or goes on.
-    pub fn tell(&self, part: Part, why: Option<&str>) {
+    /// A part waits, or goes on, as of `now`.
+    pub fn tell(&self, part: Part, why: Option<&str>, now: SystemTime) {
         let mut reasons = self.lock();
         match (why, reasons.get_mut(&part)) {
             (None, _) => _ = reasons.remove(&part),
             (Some(why), Some(reason)) => why.clone_into(&mut reason.why),
             (Some(why), None) => {
-                let (why, since) = (why.to_owned(), SystemTime::now());
+                let (why, since) = (why.to_owned(), now);
                 reasons.insert(part, Reason { why, since });
             }
         }
@@ -64,6 +66,7 @@ impl PartialEq for HeldUp {
 pub(crate) struct Heard<'a> {
     pub(crate) inner: &'a dyn Progress,
     pub(crate) reasons: HeldUp,
+    pub(crate) clock: &'a dyn Clock,
 }
 
 impl Progress for Heard<'_> {
@@ -76,32 +79,38 @@ impl Progress for Heard<'_> {
     }
 
     fn held_up(&self, why: Option<&str>) {
-        self.reasons.tell(Part::Ingest, why);
+        self.reasons.tell(Part::Ingest, why, self.clock.now());
         self.inner.held_up(why);
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use saccade_archive::clock::PretendClock;
+
     use super::*;
 
     #[test]
     fn a_part_waits_since_it_stopped_whatever_it_waits_for() {
         let held = HeldUp::default();
         let whys = |held: &HeldUp| held.now().into_iter().map(|r| r.why).collect::<Vec<_>>();
-        held.tell(Part::Ingest, Some("full"));
-        let since = held.now()[0].since;
-        std::thread::sleep(std::time::Duration::from_millis(2));
-        held.clone().tell(Part::Ingest, Some("full, still"));
+        let clock = PretendClock::default();
+        let since = clock.now();
+        held.tell(Part::Ingest, Some("full"), since);
+        clock.turn(Duration::from_secs(2));
+        held.clone()
+            .tell(Part::Ingest, Some("full, still"), clock.now());
         assert_eq!(
             (whys(&held), held.now()[0].since),
             (vec!["full, still".to_owned()], since)
         );
-        held.tell(Part::Watch, Some("away"));
+        held.tell(Part::Watch, Some("away"), clock.now());
         assert_eq!(whys(&held), ["away", "full, still"]);
-        held.tell(Part::Ingest, None);
+        held.tell(Part::Ingest, None, clock.now());
         assert_eq!(whys(&held), ["away"]);
-        held.tell(Part::Ingest, Some("full"));
-        assert!(held.now()[1].since > since);
+        held.tell(Part::Ingest, Some("full"), clock.now());
+        assert_eq!(held.now()[1].since, clock.now());
     }
 }

@@ -19,6 +19,14 @@
 //!
 //! It never changes the acquisition archive, and knows nothing of 3D: no levels, chunks or bricks.
 
+#![cfg_attr(
+    test,
+    allow(
+        clippy::disallowed_methods,
+        reason = "tests also wait for what really happens"
+    )
+)]
+
 mod cancel;
 mod held_up;
 pub mod ingest;

@@ -1,8 +1,6 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use tokio::time::Instant;
-
 /// How far some work on tiles is.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct State {
@@ -39,20 +37,20 @@ impl Progress for () {
     fn notice(&self, _: &str) {}
 }
 
-/// Measures a rate over a sliding window.
+/// Measures a rate over a sliding window. It is told how late it is, by a
+/// [`Clock`](saccade_archive::clock::Clock)'s monotonic time.
 #[derive(Debug)]
 pub struct Meter {
     window: Duration,
-    begin: Instant,
+    begin: Duration,
     /// When how many pixels were done in all.
-    marks: VecDeque<(Instant, u64)>,
+    marks: VecDeque<(Duration, u64)>,
     pixels: u64,
 }
 
 impl Meter {
-    /// Measures over the last ten seconds.
-    pub fn new() -> Self {
-        let begin = Instant::now();
+    /// Measures over the last ten seconds, from `begin` on.
+    pub fn new(begin: Duration) -> Self {
         let marks = VecDeque::from([(begin, 0)]);
         Self {
             window: Duration::from_secs(10),
@@ -63,18 +61,14 @@ impl Meter {
     }
 
     /// Pixels were done just now.
-    pub fn add(&mut self, pixels: u64) {
-        self.add_at(Instant::now(), pixels);
-    }
-
-    fn add_at(&mut self, now: Instant, pixels: u64) {
+    pub fn add(&mut self, now: Duration, pixels: u64) {
         self.pixels += pixels;
         self.marks.push_back((now, self.pixels));
         // The last mark before the window stays: the window's first interval begins there.
         while self
             .marks
             .get(1)
-            .is_some_and(|(at, _)| now - *at > self.window)
+            .is_some_and(|(at, _)| now.saturating_sub(*at) > self.window)
         {
             self.marks.pop_front();
         }
@@ -86,29 +80,19 @@ impl Meter {
     }
 
     /// Time since the meter exists.
-    pub fn elapsed(&self) -> Duration {
-        self.begin.elapsed()
+    pub fn elapsed(&self, now: Duration) -> Duration {
+        now.saturating_sub(self.begin)
     }
 
     /// The rate \[Mpixel/s\]; falls to 0 when nothing happens.
-    pub fn mpixel_per_s(&self) -> f64 {
-        self.mpixel_per_s_at(Instant::now())
-    }
-
-    fn mpixel_per_s_at(&self, now: Instant) -> f64 {
+    pub fn mpixel_per_s(&self, now: Duration) -> f64 {
         let (since, before) = self.marks.front().copied().unwrap_or((self.begin, 0));
-        let seconds = (now - since).as_secs_f64();
+        let seconds = now.saturating_sub(since).as_secs_f64();
         if seconds > 0.0 {
             (self.pixels - before) as f64 / 1e6 / seconds
         } else {
             0.0
         }
-    }
-}
-
-impl Default for Meter {
-    fn default() -> Self {
-        Self::new()
     }
 }
 
@@ -118,22 +102,21 @@ mod tests {
 
     #[test]
     fn the_rate_is_that_of_the_last_seconds() {
-        let mut meter = Meter::new();
-        let at = |begin: Instant, second| begin + Duration::from_secs(second);
-        let begin = meter.begin;
-        assert_eq!(meter.mpixel_per_s_at(begin), 0.0);
+        let at = |second: u64| Duration::from_secs(1000 + second);
+        let mut meter = Meter::new(at(0));
+        assert_eq!(meter.mpixel_per_s(at(0)), 0.0);
         for second in 1..=60 {
-            meter.add_at(at(begin, second), 8_000_000);
+            meter.add(at(second), 8_000_000);
         }
-        let rate = meter.mpixel_per_s_at(at(begin, 60));
+        let rate = meter.mpixel_per_s(at(60));
         assert!((rate - 8.0).abs() < 0.01, "{rate}");
         for second in 61..=120 {
-            meter.add_at(at(begin, second), 2_000_000);
+            meter.add(at(second), 2_000_000);
         }
-        let rate = meter.mpixel_per_s_at(at(begin, 120));
+        let rate = meter.mpixel_per_s(at(120));
         assert!((rate - 2.0).abs() < 0.01, "{rate}");
         assert!(
-            meter.mpixel_per_s_at(at(begin, 1120)) < 0.1,
+            meter.mpixel_per_s(at(1120)) < 0.1,
             "nothing happened for long"
         );
         assert_eq!(meter.pixels(), 600_000_000);

@@ -165,7 +165,7 @@ pub fn run(
     let mut archive = Archive::open(folder, &info, &settings)?;
     let mut pace = Pace::new(config.rate_mpixel_s);
     let mut summary = SimulateSummary::default();
-    let mut meter = Meter::new();
+    let mut meter = Meter::new(clock.monotonic());
     let written = |tile: &RawTile| archive.written.contains(&tile.name);
     let todo: Vec<&RawTile> = acquisition
         .tiles
@@ -208,12 +208,12 @@ pub fn run(
         summary.tiles += 1;
         summary.pixels += pixels;
         queued -= 1;
-        meter.add(pixels);
+        meter.add(clock.monotonic(), pixels);
         progress.update(&State {
             tiles: summary.tiles,
             pixels: summary.pixels,
             queued,
-            mpixel_per_s: meter.mpixel_per_s(),
+            mpixel_per_s: meter.mpixel_per_s(clock.monotonic()),
             ..State::default()
         });
     }

@@ -219,7 +219,7 @@ pub fn run(
             clock,
             cancel,
             progress,
-            meter: Meter::new(),
+            meter: Meter::new(clock.monotonic()),
             left: 0,
             summary: SimulateSummary::default(),
         };
@@ -359,7 +359,7 @@ impl Run<'_> {
         self.summary.tiles += 1;
         self.summary.pixels += pixels;
         self.left = self.left.saturating_sub(1);
-        self.meter.add(pixels);
+        self.meter.add(self.clock.monotonic(), pixels);
         self.tell();
         Ok(true)
     }
@@ -381,7 +381,7 @@ impl Run<'_> {
             tiles: self.summary.tiles,
             pixels: self.summary.pixels,
             queued: self.left,
-            mpixel_per_s: self.meter.mpixel_per_s(),
+            mpixel_per_s: self.meter.mpixel_per_s(self.clock.monotonic()),
             ..State::default()
         });
     }

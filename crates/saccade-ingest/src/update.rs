@@ -11,7 +11,6 @@
 
 use std::collections::{BTreeMap, HashSet};
 use std::io::{self, BufRead, Read as _};
-use std::time::SystemTime;
 
 use saccade_archive::acquisition::{DeleteRecord, Record, TransformRecord};
 use saccade_archive::catalog::{Catalog, CatalogError, DeleteOutcome, TransformOutcome};
@@ -331,10 +330,12 @@ async fn transaction(
                     Err(e) => return Err(e),
                 }
             }
-            Change::Delete(_) => match commit.delete(tile, position, SystemTime::now()).await? {
-                DeleteOutcome::Deleted => Outcome::Deleted,
-                DeleteOutcome::Unchanged | DeleteOutcome::Noted => Outcome::Unchanged,
-            },
+            Change::Delete(_) => {
+                match commit.delete(tile, position, catalog.clock().now()).await? {
+                    DeleteOutcome::Deleted => Outcome::Deleted,
+                    DeleteOutcome::Unchanged | DeleteOutcome::Noted => Outcome::Unchanged,
+                }
+            }
         };
         match outcome {
             Outcome::Moved => summary.moved += 1,

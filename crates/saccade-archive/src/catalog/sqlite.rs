@@ -15,6 +15,7 @@ use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
 
+use crate::clock::{Clock as _, SystemClock};
 mod replaced;
 
 use replaced::Replaced;
@@ -211,7 +212,7 @@ async fn connect(
                 if !error.is_busy() || tries == TRIES {
                     return Err(error);
                 }
-                tokio::time::sleep(BUSY / TRIES).await;
+                SystemClock.sleep(BUSY / TRIES).await;
             }
         }
     }
@@ -350,7 +351,7 @@ async fn migrate(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
                 }
                 log::debug!("another process is making the catalog: {error}");
                 attempts += 1;
-                tokio::time::sleep(Duration::from_millis(50)).await;
+                SystemClock.sleep(Duration::from_millis(50)).await;
             }
             Err(e) => return Err(failed(sqlx::Error::Migrate(Box::new(e)))),
         }

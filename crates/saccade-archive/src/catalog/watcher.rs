@@ -126,7 +126,7 @@ async fn listen(following: &Following, pool: &PgPool) {
                 if !std::mem::replace(&mut lost, true) {
                     log::warn!("changes are not heard, trying again: {e}: {location}");
                 }
-                tokio::time::sleep(TRY_AGAIN).await;
+                SystemClock.sleep(TRY_AGAIN).await;
             }
         }
     }
@@ -186,7 +186,7 @@ async fn poll(following: &Following) {
             }
         }
         drop(catalog);
-        tokio::time::sleep(POLL).await;
+        SystemClock.sleep(POLL).await;
     }
 }
 

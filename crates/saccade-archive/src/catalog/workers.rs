@@ -227,7 +227,8 @@ impl Catalog {
             match rows::claim(&row) {
                 Ok(claim) => claims.push(claim),
                 Err(error) => {
-                    let done = set_aside(&mut transaction, volume, &row, error).await;
+                    let now = self.clock().now();
+                    let done = set_aside(&mut transaction, volume, &row, error, now).await;
                     done.map_err(|e| self.failed(e))?;
                 }
             }
@@ -307,9 +308,8 @@ impl Catalog {
                        ORDER BY h.since, h.worker, h.number",
         };
         let now = match (self.inner.clock.get(), &self.inner.database) {
-            (Some(clock), _) => rows::millis(clock.now()),
-            (None, Database::Sqlite(_)) => rows::millis(SystemTime::now()),
             (None, Database::Postgres(_)) => -1,
+            (_, _) => rows::millis(self.clock().now()),
         };
         self.ask(question, &[volume.into(), now.into()], rows::held_up)
             .await
@@ -352,12 +352,9 @@ impl Catalog {
 
     /// Where several machines share a catalog, their clocks differ: the server's counts.
     async fn now(&self, transaction: &mut Transaction) -> Result<SystemTime, CatalogError> {
-        if let Some(clock) = self.inner.clock.get() {
-            return Ok(clock.now());
-        }
-        match &self.inner.database {
-            Database::Sqlite(_) => Ok(SystemTime::now()),
-            Database::Postgres(_) => {
+        match (self.inner.clock.get(), &self.inner.database) {
+            (Some(_), _) | (_, Database::Sqlite(_)) => Ok(self.clock().now()),
+            (None, Database::Postgres(_)) => {
                 let ask = "SELECT (extract(epoch FROM clock_timestamp()) * 1000)::bigint AS now";
                 let row = transaction.one(ask, &[]).await;
                 let now =
@@ -374,6 +371,7 @@ async fn set_aside(
     volume: i64,
     row: &Row,
     error: sqlx::Error,
+    now: SystemTime,
 ) -> Result<(), sqlx::Error> {
     let (tile, reason) = (rows::legible(row, "tile"), rows::reason_of(error));
     let reason = format!(
@@ -386,7 +384,7 @@ async fn set_aside(
         RecordReader::FILE.into(),
         (&tile).into(),
         (&reason).into(),
-        rows::millis(SystemTime::now()).into(),
+        rows::millis(now).into(),
     ];
     transaction.run(insert, &values).await?;
     let position = row.get::<i64>("position")?;

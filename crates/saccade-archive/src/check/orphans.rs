@@ -1,7 +1,6 @@
 //! What nothing names.
 
 use std::hash::BuildHasher as _;
-use std::time::SystemTime;
 
 use super::repair::position_of;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
@@ -11,7 +10,7 @@ use crate::storage::Entry;
 impl Check<'_> {
     /// Finds what nothing names.
     pub(super) async fn orphans(&mut self, objects: &[Entry]) -> Result<(), CheckError> {
-        let now = SystemTime::now();
+        let now = self.archive.catalog().clock().now();
         for object in objects {
             let volume = volume_of(&object.name).unwrap_or_default();
             if self.is_unknown(volume) || self.may_be_of_a_tile(&object.name) {

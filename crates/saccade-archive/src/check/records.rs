@@ -1,7 +1,7 @@
 //! What the catalog says against what the records say.
 
 use std::collections::HashMap;
-use std::hash::{BuildHasher, RandomState};
+use std::hash::BuildHasher as _;
 use std::path::Path;
 
 use glam::UVec2;
@@ -10,6 +10,7 @@ use super::repair::position_of;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
 use crate::acquisition::{AcquisitionInfo, Cursor, Record, RecordReader};
 use crate::catalog::{CatalogError, Tile, VolumeEntry};
+use crate::randomness::Keyed;
 
 /// Records that are read at once.
 const AT_ONCE: usize = 4096;
@@ -18,7 +19,7 @@ const AT_ONCE: usize = 4096;
 #[derive(Debug)]
 pub(super) struct Records {
     newest: HashMap<u64, Newest>,
-    hasher: RandomState,
+    hasher: Keyed,
 }
 
 /// The newest record of a tile's image, or of its end.
@@ -42,11 +43,11 @@ struct Image {
 
 impl Records {
     /// Those up to `read`, if they are what was read.
-    fn read(folder: &Path, read: Cursor, channels: &[String]) -> Option<Self> {
+    fn read(folder: &Path, read: Cursor, channels: &[String], hasher: Keyed) -> Option<Self> {
         RecordReader::new(folder, read).recognize().ok()?;
         let mut records = Self {
             newest: HashMap::new(),
-            hasher: RandomState::new(),
+            hasher,
         };
         let mut reader = RecordReader::new(folder, Cursor::default());
         while reader.cursor().offset < read.offset {
@@ -185,7 +186,8 @@ impl Check<'_> {
             return Ok(());
         };
         let (channels, of) = (entry.volume.channels.clone(), folder.clone());
-        let work = move || Records::read(&of, read, &channels);
+        let hasher = Keyed::new(self.archive.randomness());
+        let work = move || Records::read(&of, read, &channels, hasher);
         self.records = tokio::task::spawn_blocking(work).await.unwrap_or_default();
         let info = AcquisitionInfo::read(&folder).ok();
         let Some(volume) = info.and_then(|info| info.volume().ok()) else {

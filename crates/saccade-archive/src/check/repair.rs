@@ -1,7 +1,6 @@
 //! What the records say, and giving tiles back to ingest.
 
 use std::path::PathBuf;
-use std::time::SystemTime;
 
 use super::{Check, CheckError, FindingKind, Repair};
 use crate::acquisition::{Cursor, Record, RecordReader, TileRecord, image_path};
@@ -43,7 +42,7 @@ impl Check<'_> {
                 "{what} ({reason}); append the tile's record to its acquisition once more, and ingest makes it anew"
             ),
             bytes: None,
-            at: SystemTime::now(),
+            at: self.archive.catalog().clock().now(),
         };
         let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
         commit.quarantine(&what).await?;

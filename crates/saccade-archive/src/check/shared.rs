@@ -1,7 +1,5 @@
 //! Tiles that name one pyramid.
 
-use std::time::SystemTime;
-
 use super::repair::position_of;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
 use crate::acquisition::RecordReader;
@@ -77,7 +75,7 @@ impl Check<'_> {
                         "{reason}; append the tile's record to its acquisition once more, and ingest makes its own"
                     ),
                     bytes: Some(0),
-                    at: SystemTime::now(),
+                    at: self.archive.catalog().clock().now(),
                 };
                 commit.quarantine(&what).await?;
                 Repair::Quarantined

@@ -2,8 +2,8 @@ use std::collections::BTreeSet;
 use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use bytes::Bytes;
 use futures::FutureExt as _;
@@ -11,6 +11,7 @@ use futures::future::BoxFuture;
 
 use super::disk::{Disk, SystemDisk};
 use super::{Entry, Storage, StorageError, check_name};
+use crate::randomness::{Randomness, SystemRandomness};
 
 mod root;
 
@@ -21,9 +22,6 @@ const INCOMING: &str = ".incoming";
 
 /// How often a write begins whose temporary file someone has, or removes.
 const WRITE_ATTEMPTS: u32 = 100;
-
-/// Number of this process's next temporary file.
-static NEXT: AtomicU64 = AtomicU64::new(0);
 
 /// Objects as files below a folder, local or on a shared file system.
 ///
@@ -51,6 +49,8 @@ struct Inner {
     kept: Mutex<BTreeSet<PathBuf>>,
     /// Whether a sync has failed.
     stopped: AtomicBool,
+    /// Where the names of temporary files come from; empty: the machine's.
+    randomness: OnceLock<Arc<dyn Randomness>>,
 }
 
 /// What went wrong with a step of a write.
@@ -132,7 +132,15 @@ impl LocalStorage {
             known: Root::default(),
             kept: Mutex::default(),
             stopped: AtomicBool::new(false),
+            randomness: OnceLock::new(),
         }))
+    }
+
+    /// Draws the names of temporary files from this instead of the machine's randomness. Has an effect once.
+    #[must_use]
+    pub fn with_randomness(self, randomness: Arc<dyn Randomness>) -> Self {
+        drop(self.0.randomness.set(randomness));
+        self
     }
 
     /// The folder.
@@ -260,7 +268,7 @@ impl Inner {
                 Err(WriteError::Io(e)) if e.kind() == io::ErrorKind::NotFound => {
                     self.kept().clear();
                 }
-                // A process of the same number, on another machine or before this one.
+                // Another draws from the same seed.
                 Err(WriteError::Io(e)) if e.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(e) => return Err(e),
             }
@@ -269,11 +277,11 @@ impl Inner {
     }
 
     fn write_once(&self, path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let temporary = self
-            .root
-            .join(INCOMING)
-            .join(format!("{}-{number}", std::process::id()));
+        let number = match self.randomness.get() {
+            Some(randomness) => randomness.next(),
+            None => SystemRandomness.next(),
+        };
+        let temporary = self.root.join(INCOMING).join(format!("{number:016x}"));
         let mut file = self.disk.create_new(&temporary)?;
         // Tells a cleaner that the writer lives. Where locks do not exist, cleaners get none.
         file.lock();

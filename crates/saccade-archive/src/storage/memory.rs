@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
 use bytes::Bytes;
@@ -8,17 +8,34 @@ use futures::FutureExt as _;
 use futures::future::{BoxFuture, ready};
 
 use super::{Entry, Storage, StorageError, check_name};
+use crate::clock::{Clock, SystemClock};
 
 /// Objects in memory, for tests and for demonstrations that leave nothing behind.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct MemoryStorage {
     objects: Mutex<BTreeMap<String, (Bytes, SystemTime)>>,
+    clock: Arc<dyn Clock>,
+}
+
+impl Default for MemoryStorage {
+    fn default() -> Self {
+        Self {
+            objects: Mutex::default(),
+            clock: Arc::new(SystemClock),
+        }
+    }
 }
 
 impl MemoryStorage {
     /// An empty storage.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// Tells when objects were written by this clock instead of the machine's.
+    #[must_use]
+    pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
+        Self { clock, ..self }
     }
 
     fn objects(&self) -> MutexGuard<'_, BTreeMap<String, (Bytes, SystemTime)>> {
@@ -62,7 +79,7 @@ impl Storage for MemoryStorage {
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>> {
         ready(check_name(name).map(|()| {
-            let object = (bytes, SystemTime::now());
+            let object = (bytes, self.clock.now());
             self.objects().insert(name.to_owned(), object);
         }))
         .boxed()
@@ -96,8 +113,6 @@ impl Storage for MemoryStorage {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use super::*;
 
     #[tokio::test]

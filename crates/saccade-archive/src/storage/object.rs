@@ -15,6 +15,7 @@ use object_store::{
 };
 
 use super::{Entry, Storage, StorageError, check_name};
+use crate::clock::{Clock as _, SystemClock};
 
 mod location;
 mod sort;
@@ -275,7 +276,7 @@ impl ObjectStorage {
                     return Ok(entries);
                 }
             }
-            tokio::time::sleep(pause).await;
+            SystemClock.sleep(pause).await;
             pause *= 2;
         }
     }

@@ -7,12 +7,11 @@
 //! A catalog that knows of nothing does not belong to a storage that holds pyramids: they are another's, or their
 //! own catalog was lost. To take everything in again over them would change them under who still reads them.
 
-use std::hash::{BuildHasher, Hasher, RandomState};
-
 use bytes::Bytes;
 
 use super::{ArchiveError, ArchiveLocation};
 use crate::catalog::{Catalog, CatalogLocation};
+use crate::randomness::Randomness;
 use crate::storage::{Storage, StorageError};
 
 /// Name of the storage's object that holds the identity.
@@ -25,9 +24,8 @@ pub(super) const PYRAMIDS: &str = "tiles/";
 const DIGITS: usize = 32;
 
 /// Another one than any before.
-fn random() -> String {
-    let random = || RandomState::new().build_hasher().finish();
-    format!("{:016x}{:016x}", random(), random())
+fn random(randomness: &dyn Randomness) -> String {
+    format!("{:016x}{:016x}", randomness.next(), randomness.next())
 }
 
 /// The identity that the bytes of [`IDENTITY`] say; `None` if they are cut short or otherwise damaged.
@@ -157,6 +155,7 @@ pub(super) async fn make(
         Mark::Whole(identity) => Some(identity),
         Mark::None => None,
         Mark::Damaged => {
+    randomness: &dyn Randomness,
             log::warn!(
                 "the object {IDENTITY:?} of {} was damaged, and is written anew: pyramids that its catalog names \
                  are there",
@@ -166,7 +165,10 @@ pub(super) async fn make(
         }
     };
     // The catalog decides, where several processes do this at once.
-    let proposed = there.clone().or(parts.catalog).unwrap_or_else(random);
+    let proposed = there
+        .clone()
+        .or(parts.catalog)
+        .unwrap_or_else(|| random(randomness));
     let identity = catalog.give_identity(&proposed).await?;
     match there {
         Some(there) if there == identity => {}
@@ -234,6 +236,7 @@ mod tests {
         let pyramid = format!("tiles/{}", folder.file_name().unwrap().display());
         let tile = NewTile {
             name: "t".to_owned(),
+    use crate::randomness::SystemRandomness;
             section: 0,
             channel: 0,
             size: UVec2::splat(8),
@@ -408,7 +411,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_damaged_identity_is_mended_where_pyramids_are_known() {
-        let whole = format!("{}\n", random());
+        let whole = format!("{}\n", random(&SystemRandomness));
         for damaged in [
             "",
             "\n",

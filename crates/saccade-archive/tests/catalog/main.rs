@@ -2,6 +2,10 @@
 //! several processes, several workers.
 
 #![expect(clippy::unwrap_used, reason = "a test that cannot go on fails")]
+#![allow(
+    clippy::disallowed_methods,
+    reason = "tests also wait for what really happens"
+)]
 #![expect(clippy::cast_possible_truncation, reason = "small whole numbers")]
 
 mod place;

@@ -2,36 +2,19 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use saccade_archive::acquisition::Cursor;
-use saccade_archive::catalog::{Catalog, CatalogError, Clock, TileOutcome, Waiting};
+use saccade_archive::catalog::{Catalog, CatalogError, TileOutcome, Waiting};
+use saccade_archive::clock::PretendClock;
 
 use crate::place::Place;
 use crate::suite::{SIZE, all_changes, at, tile, tiles, waiting};
 
 const LEASE: Duration = Duration::from_secs(20);
 
-/// Stands still until it is turned.
-#[derive(Debug, Default)]
-struct Turned(AtomicU64);
-
-impl Turned {
-    fn turn(&self, by: Duration) {
-        self.0.fetch_add(by.as_millis() as u64, Ordering::Relaxed);
-    }
-}
-
-impl Clock for Turned {
-    fn now(&self) -> SystemTime {
-        let since = Duration::from_millis(self.0.load(Ordering::Relaxed));
-        SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000) + since
-    }
-}
-
-async fn timed(place: &Place) -> (Catalog, Arc<Turned>) {
-    let clock = Arc::new(Turned::default());
+async fn timed(place: &Place) -> (Catalog, Arc<PretendClock>) {
+    let clock = Arc::new(PretendClock::default());
     (place.catalog().await.with_clock(clock.clone()), clock)
 }
 

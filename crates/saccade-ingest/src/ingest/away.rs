@@ -1,10 +1,9 @@
 //! What was followed before and is away when work begins.
 
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::{CatalogError, Worker};
-use tokio::time::Instant;
 
 use super::IngestOptions;
 use super::process;
@@ -31,13 +30,14 @@ pub async fn wait_until_there(
             None
         }
     };
-    let mut sign = Instant::now();
+    let clock = archive.catalog().clock();
+    let mut sign = clock.monotonic();
     while !is_there() && !cancel.is_cancelled() {
-        tokio::time::sleep(LOOKS).await;
+        clock.sleep(LOOKS).await;
         if let Some(worker) = &worker
-            && sign.elapsed() > options.lease / 4
+            && clock.monotonic() - sign > options.lease / 4
         {
-            sign = Instant::now();
+            sign = clock.monotonic();
             if let Err(e) = archive.catalog().keep_alive(worker).await {
                 log::debug!("no sign of life could be given: {e}");
             }
@@ -62,7 +62,7 @@ async fn tell(
     let worker = catalog
         .register_process(&worker_name(), &process, options.lease)
         .await?;
-    let reasons = [(why.to_owned(), SystemTime::now())];
+    let reasons = [(why.to_owned(), catalog.clock().now())];
     catalog.tell_held_up(volume, &worker, &reasons).await?;
     Ok(worker)
 }

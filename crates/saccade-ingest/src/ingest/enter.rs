@@ -11,6 +11,7 @@ use saccade_archive::acquisition::RecordReader;
 use saccade_archive::catalog::{
     CatalogError, Commit, DeleteOutcome, Quarantined, TileOutcome, TransformOutcome, Worker,
 };
+use saccade_archive::clock::Clock;
 
 use super::prepare::{Backoff, Context, Outcome};
 use super::run::{Summary, state};
@@ -32,7 +33,6 @@ pub(super) struct Ready {
 /// Enters records.
 pub(super) struct Enter<'a> {
     pub(super) archive: &'a VisualizationArchive,
-    pub(super) options: &'a IngestOptions,
     pub(super) context: &'a Context<'a>,
     pub(super) worker: &'a Worker,
     pub(super) room: &'a mut WaitingRoom,
@@ -86,7 +86,7 @@ pub(super) struct Done {
 impl Enter<'_> {
     pub(super) async fn commit(&mut self, ready: Vec<Ready>) -> Result<(), IngestError> {
         let progress = self.context.progress;
-        let mut done = retry(self.options, progress, || self.transaction(&ready)).await?;
+        let mut done = self.context.retry(|| self.transaction(&ready)).await?;
         for notice in &done.notices {
             progress.notice(notice);
         }
@@ -103,7 +103,8 @@ impl Enter<'_> {
             .set_aside
             .note(std::mem::take(&mut done.changes));
         self.summary.quarantined = self.context.set_aside.count();
-        self.meter.add(done.summary.pixels);
+        let now = self.archive.catalog().clock().monotonic();
+        self.meter.add(now, done.summary.pixels);
         let left = self.left.load(Ordering::Relaxed);
         let left = left.saturating_sub(ready.len() as u64);
         self.left.store(left, Ordering::Relaxed);
@@ -117,7 +118,12 @@ impl Enter<'_> {
                 _ => self.room.leave(position),
             }
         }
-        progress.update(&state(self.summary, self.meter, self.room, self.left));
+        progress.update(&state(
+            self.summary,
+            self.meter.mpixel_per_s(now),
+            self.room,
+            self.left,
+        ));
         Ok(())
     }
 
@@ -131,7 +137,8 @@ impl Enter<'_> {
                 done.lost.push(*position);
                 continue;
             }
-            done.apply(&mut commit, outcome).await?;
+            done.apply(&mut commit, outcome, self.archive.catalog().clock().now())
+                .await?;
             if !matches!(outcome, Outcome::Wait { .. }) {
                 commit.wait_no_more(*position).await?;
             }
@@ -147,8 +154,8 @@ impl Done {
         &mut self,
         commit: &mut Commit<'_>,
         outcome: &Outcome,
+        now: SystemTime,
     ) -> Result<(), CatalogError> {
-        let now = SystemTime::now();
         match outcome {
             Outcome::Tile { tile, pixels } => match commit.tile(tile, now).await? {
                 TileOutcome::New | TileOutcome::Replaced => {
@@ -194,7 +201,7 @@ impl Done {
             }
             Outcome::Wait { waiting, .. } => commit.wait(waiting).await?,
             Outcome::Quarantine { what, pyramid } => {
-                self.quarantine(commit, what).await?;
+                self.quarantine(commit, &what.set_aside(now)).await?;
                 self.orphans.extend(pyramid.clone());
             }
         }
@@ -221,6 +228,7 @@ impl Done {
 /// Tries a transaction again: some times if the failure may pass, and as long as the disk is full or
 /// the server away.
 pub(super) async fn retry<T, F>(
+    clock: &dyn Clock,
     options: &IngestOptions,
     progress: &dyn Progress,
     mut transaction: impl FnMut() -> F,
@@ -228,7 +236,7 @@ pub(super) async fn retry<T, F>(
 where
     F: Future<Output = Result<T, CatalogError>>,
 {
-    let mut backoff = Backoff::new(options.retry);
+    let mut backoff = Backoff::new(options.retry, clock);
     let mut over = "";
     loop {
         match transaction().await {

@@ -2,13 +2,15 @@
 //! becomes an outcome.
 
 use std::fs;
+use std::future::Future;
 use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
 use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord};
-use saccade_archive::catalog::{Catalog, NewTile, Quarantined, Waiting, place};
+use saccade_archive::catalog::{Catalog, CatalogError, NewTile, Quarantined, Waiting, place};
+use saccade_archive::clock::Clock;
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
 use saccade_archive::storage::{Storage, StorageError};
@@ -61,9 +63,31 @@ pub(super) enum Outcome {
     },
     /// It cannot become a tile.
     Quarantine {
-        what: Quarantined,
+        what: Unfit,
         pyramid: Option<String>,
     },
+}
+
+/// What cannot become a tile.
+#[derive(Debug)]
+pub(super) struct Unfit {
+    pub(super) file: String,
+    pub(super) tile: Option<String>,
+    pub(super) reason: String,
+    pub(super) bytes: Option<u64>,
+}
+
+impl Unfit {
+    /// As it is entered.
+    pub(super) fn set_aside(&self, at: SystemTime) -> Quarantined {
+        Quarantined {
+            file: self.file.clone(),
+            tile: self.tile.clone(),
+            reason: self.reason.clone(),
+            bytes: self.bytes,
+            at,
+        }
+    }
 }
 
 impl Outcome {
@@ -155,6 +179,14 @@ pub(super) struct Context<'a> {
 }
 
 impl Context<'_> {
+    /// Asks the catalog, again and again while it is away.
+    pub(super) async fn retry<T, F>(&self, ask: impl FnMut() -> F) -> Result<T, CatalogError>
+    where
+        F: Future<Output = Result<T, CatalogError>>,
+    {
+        retry(self.catalog.clock(), self.options, self.progress, ask).await
+    }
+
     /// Makes a tile of a record, up to its durable pyramid.
     pub(super) async fn tile(
         &self,
@@ -304,7 +336,7 @@ impl Context<'_> {
     async fn unused_name(&self, record: &TileRecord, position: u64) -> Result<String, IngestError> {
         // Also of a tile of which nothing else can be understood, which this record mends.
         let entered = || self.catalog.tile_pyramid(self.volume, &record.tile);
-        let entered = retry(self.options, self.progress, entered).await?;
+        let entered = self.retry(entered).await?;
         let attempt = entered.map_or(0, |pyramid| attempt_after(&pyramid, position));
         Ok(pyramid_name(self.volume, record, position, attempt))
     }
@@ -317,7 +349,7 @@ impl Context<'_> {
         name: &str,
         pyramid: Bytes,
     ) -> Result<Result<(), StorageError>, IngestError> {
-        let mut backoff = Backoff::new(self.options.retry);
+        let mut backoff = Backoff::new(self.options.retry, self.catalog.clock());
         loop {
             match self.storage.write_durable(name, pyramid.clone()).await {
                 Ok(()) => {
@@ -407,12 +439,11 @@ pub(super) fn quarantine(
 ) -> Outcome {
     let (file, tile) = (images.name(&record.file), Some(record.tile.clone()));
     Outcome::Quarantine {
-        what: Quarantined {
+        what: Unfit {
             file,
             tile,
             reason,
             bytes,
-            at: SystemTime::now(),
         },
         pyramid,
     }
@@ -459,19 +490,21 @@ fn attempt_after(pyramid: &str, position: u64) -> u32 {
 
 /// Pauses between attempts: doubling, up to sixteen times the first. What is waited out, however long, is looked
 /// for more often: when it is there again, work goes on soon.
-pub(super) struct Backoff {
+pub(super) struct Backoff<'a> {
+    clock: &'a dyn Clock,
     first: Duration,
     pause: Duration,
     outage: bool,
     pub(super) failures: u32,
 }
 
-impl Backoff {
+impl<'a> Backoff<'a> {
     /// Attempts at what may be a passing failure, before it counts as lasting.
     const ATTEMPTS: u32 = 10;
 
-    pub(super) fn new(first: Duration) -> Self {
+    pub(super) fn new(first: Duration, clock: &'a dyn Clock) -> Self {
         Self {
+            clock,
             first,
             pause: first,
             outage: false,
@@ -504,7 +537,8 @@ impl Backoff {
             progress.notice(&format!("{why}; trying again"));
         }
         progress.held_up(Some(&why));
-        tokio::time::sleep(self.next_pause()).await;
+        let pause = self.next_pause();
+        self.clock.sleep(pause).await;
     }
 
     fn next_pause(&mut self) -> Duration {
@@ -518,6 +552,7 @@ impl Backoff {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use saccade_archive::clock::SystemClock;
     use saccade_archive::storage::check_name;
     use saccade_core::transform::SectionFromTile;
 
@@ -525,7 +560,7 @@ mod tests {
     fn outages_are_looked_after_often_and_other_failures_ever_less() {
         let first = Duration::from_secs(1);
         let pauses = |outage| {
-            let mut backoff = Backoff::new(first);
+            let mut backoff = Backoff::new(first, &SystemClock);
             let pause = |_| {
                 assert!(backoff.may_go_on(outage, true));
                 backoff.next_pause().as_secs()

@@ -26,7 +26,7 @@ pub(super) async fn tell(
 ) {
     let mut told = Vec::new();
     loop {
-        tokio::time::sleep(LOOKS).await;
+        archive.catalog().clock().sleep(LOOKS).await;
         let now = held_up.now();
         if now == told {
             continue;

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use saccade_archive::acquisition::{AcquisitionError, RecordReader};
-use tokio::time::Instant;
+use saccade_archive::clock::Clock;
 
 use super::prepare::Backoff;
 use super::{IngestError, IngestOptions};
@@ -15,11 +15,12 @@ const ATTEMPTS_ONCE: u32 = 4;
 /// Asks the records. A share that fails for a moment does not end the stream, and neither do records that are
 /// being written anew.
 pub(super) async fn patiently<T>(
+    clock: &dyn Clock,
     options: &IngestOptions,
     progress: &dyn Progress,
     mut ask: impl FnMut() -> Result<T, AcquisitionError>,
 ) -> Result<T, IngestError> {
-    let mut backoff = Backoff::new(options.retry);
+    let mut backoff = Backoff::new(options.retry, clock);
     let mut cut = None;
     loop {
         match ask() {
@@ -34,7 +35,7 @@ pub(super) async fn patiently<T>(
             // Copying programs and editors cut a file before they write it anew.
             Err(AcquisitionError::RecordsCut { len, read, path }) => {
                 let patience = options.poll * options.patience;
-                let now = Instant::now();
+                let now = clock.monotonic();
                 let cut = cut.get_or_insert_with(|| Cut::new(len, now));
                 if !cut.may_become_whole(len, now, patience) {
                     return Err(AcquisitionError::RecordsCut { len, read, path }.into());
@@ -50,7 +51,7 @@ pub(super) async fn patiently<T>(
                     cut.told = true;
                 }
                 progress.held_up(Some(&why));
-                tokio::time::sleep(options.poll).await;
+                clock.sleep(options.poll).await;
             }
             Err(e) => {
                 // Who waits for the end is told, rather than kept; a stream waits for its share.
@@ -68,13 +69,13 @@ pub(super) async fn patiently<T>(
 /// Records that are shorter than what was read of them.
 struct Cut {
     /// When they were first so, or grew last.
-    since: Instant,
+    since: Duration,
     len: u64,
     told: bool,
 }
 
 impl Cut {
-    fn new(len: u64, now: Instant) -> Self {
+    fn new(len: u64, now: Duration) -> Self {
         Self {
             since: now,
             len,
@@ -84,12 +85,12 @@ impl Cut {
 
     /// Whether it is still worth waiting. What grows is waited for as long as it does, once enough of it is there to
     /// be known as the same: else it may be another acquisition, tile by tile.
-    fn may_become_whole(&mut self, len: u64, now: Instant, patience: Duration) -> bool {
+    fn may_become_whole(&mut self, len: u64, now: Duration, patience: Duration) -> bool {
         if len > self.len && len >= RecordReader::KNOWN_BY {
             self.since = now;
         }
         self.len = len;
-        now.duration_since(self.since) < patience
+        now.saturating_sub(self.since) < patience
     }
 }
 
@@ -111,7 +112,7 @@ mod tests {
             ([known; 4], [true, true, false, false]),
             ([known, 0, known, 0], [true; 4]),
         ] {
-            let begin = Instant::now();
+            let begin = Duration::from_secs(1000);
             let mut cut = Cut::new(lens[0], begin);
             for (look, (len, wait)) in (0..).zip(lens.into_iter().zip(waits)) {
                 let now = begin + Duration::from_secs(20) * look;

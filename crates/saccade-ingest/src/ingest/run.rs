@@ -12,10 +12,10 @@ use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
 use saccade_archive::catalog::{CatalogError, Waiting, Worker};
+use saccade_archive::clock::Clock;
 use saccade_archive::storage::StorageError;
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
-use tokio::time::Instant;
 
 use super::enter::{COMMIT_AT_ONCE, Enter, SetAside, retry};
 use super::images::Images;
@@ -74,6 +74,7 @@ pub async fn run(
     let heard = Heard {
         inner: progress,
         reasons: held_up.clone(),
+        clock: archive.catalog().clock(),
     };
     let progress: &dyn Progress = &heard;
     let info = AcquisitionInfo::read(acquisition)?;
@@ -88,11 +89,12 @@ pub async fn run(
         None => check_name(&volume.name).map_err(impossible)?,
     }
     let catalog = archive.catalog();
-    retry(options, progress, || catalog.create_volume(&volume)).await?;
+    let clock = catalog.clock();
+    retry(clock, options, progress, || catalog.create_volume(&volume)).await?;
     // Before anything is worked on: what is in the queue may be of another acquisition.
-    let cursor = retry(options, progress, || catalog.cursor(&volume.name)).await?;
+    let cursor = retry(clock, options, progress, || catalog.cursor(&volume.name)).await?;
     let mut reader = RecordReader::new(acquisition, cursor);
-    let known = patiently(options, progress, || reader.recognize()).await?;
+    let known = patiently(clock, options, progress, || reader.recognize()).await?;
     if known != cursor {
         let learn = async || {
             let mut commit = catalog.begin(&volume.name).await?;
@@ -100,7 +102,7 @@ pub async fn run(
             commit.advance(cursor, known).await?;
             commit.finish().await
         };
-        retry(options, progress, learn).await?;
+        retry(clock, options, progress, learn).await?;
     }
     let (stored, why) = Stored::new(volume.dtype, volume.kind, options.encoding);
     if let Some(why) = why {
@@ -108,7 +110,7 @@ pub async fn run(
     }
     let (name, process) = (worker_name(), process::this().unwrap_or_default());
     let register = || catalog.register_process(&name, &process, options.lease);
-    let worker = retry(options, progress, register).await?;
+    let worker = retry(clock, options, progress, register).await?;
     let mut ingest = Ingest {
         archive,
         options,
@@ -127,7 +129,7 @@ pub async fn run(
         worker: &worker,
         reader,
         room: WaitingRoom::new(options.patience, options.poll, Vec::new()),
-        meter: Meter::new(),
+        meter: Meter::new(clock.monotonic()),
         summary: Summary::default(),
         left: AtomicU64::new(0),
     };
@@ -183,17 +185,19 @@ pub(super) fn worker_name() -> String {
 /// machine that can give none are looked for, however much there is to do.
 async fn keep_alive(archive: &VisualizationArchive, worker: &Worker) {
     let pause = (worker.lease() / 4).min(LOOK_FOR_THE_DEAD);
-    let (mut sign, mut look) = (Instant::now(), Instant::now());
+    let clock = archive.catalog().clock();
+    let mut sign = clock.monotonic();
+    let mut look = sign;
     loop {
-        tokio::time::sleep(pause).await;
-        if sign.elapsed() + pause > worker.lease() / 4 {
-            sign = Instant::now();
+        clock.sleep(pause).await;
+        if clock.monotonic() - sign + pause > worker.lease() / 4 {
+            sign = clock.monotonic();
             if let Err(e) = archive.catalog().keep_alive(worker).await {
                 log::warn!("no sign of life could be given: {e}");
             }
         }
-        if look.elapsed() + pause > LOOK_FOR_THE_DEAD {
-            look = Instant::now();
+        if clock.monotonic() - look + pause > LOOK_FOR_THE_DEAD {
+            look = clock.monotonic();
             if let Err(e) = bury_the_dead(archive).await {
                 log::debug!("workers that have ended could not be looked for: {e}");
             }
@@ -227,6 +231,10 @@ struct Ingest<'a> {
 }
 
 impl Ingest<'_> {
+    fn clock(&self) -> &dyn Clock {
+        self.archive.catalog().clock()
+    }
+
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
             let images = self.context.images;
@@ -244,20 +252,20 @@ impl Ingest<'_> {
                 .store(queued + self.reader.remaining_lines(), Ordering::Relaxed);
             self.context.progress.update(&state(
                 &self.summary,
-                &self.meter,
+                self.meter.mpixel_per_s(self.clock().monotonic()),
                 &self.room,
                 &self.left,
             ));
             if worked == 0 && queued + waiting > 0 {
                 let bury = || bury_the_dead(self.archive);
-                retry(self.options, self.context.progress, bury).await?;
+                self.context.retry(bury).await?;
             }
             // Others may still be at work; should they die, it is this one's turn.
             if worked == 0 && self.options.once && queued + waiting == 0 {
                 return Ok(());
             }
             if worked < self.options.batch {
-                tokio::time::sleep(self.options.poll).await;
+                self.clock().sleep(self.options.poll).await;
             }
         }
     }
@@ -283,7 +291,6 @@ impl Ingest<'_> {
         supply.read_ahead().await?;
         let mut enter = Enter {
             archive: self.archive,
-            options: self.options,
             context: &self.context,
             worker: self.worker,
             room: &mut self.room,
@@ -319,27 +326,27 @@ impl Ingest<'_> {
             }
             commit.finish().await
         };
-        retry(self.options, self.context.progress, queue).await?;
+        self.context.retry(queue).await?;
         Ok(())
     }
 
     async fn count(&self) -> Result<(u64, u64), IngestError> {
         let count = || self.archive.catalog().queued(self.context.volume);
-        Ok(retry(self.options, self.context.progress, count).await?)
+        Ok(self.context.retry(count).await?)
     }
 
     /// Deletes pyramids that nobody should be reading any more.
     async fn delete_retired(&mut self) -> Result<(), IngestError> {
         let catalog = self.archive.catalog();
-        let before = SystemTime::now().checked_sub(self.options.keep_retired);
+        let before = self.clock().now().checked_sub(self.options.keep_retired);
         let before = before.unwrap_or(SystemTime::UNIX_EPOCH);
         let volume = self.context.volume;
         let list = || catalog.retired(volume, before, DELETE_AT_ONCE);
-        let retired = retry(self.options, self.context.progress, list).await?;
+        let retired = self.context.retry(list).await?;
         let mut done = Vec::new();
         for old in retired {
             let named = || catalog.is_named(volume, &old.pyramid);
-            if retry(self.options, self.context.progress, named).await? {
+            if self.context.retry(named).await? {
                 log::warn!(
                     "a tile names the pyramid {}, which was to be deleted: it is kept",
                     old.pyramid
@@ -359,21 +366,21 @@ impl Ingest<'_> {
         if done.is_empty() {
             return Ok(());
         }
-        retry(self.options, self.context.progress, async || {
+        let forget = async || {
             let mut commit = catalog.begin(volume).await?;
             for pyramid in &done {
                 commit.forget_retired(pyramid).await?;
             }
             commit.finish().await
-        })
-        .await?;
+        };
+        self.context.retry(forget).await?;
         Ok(())
     }
 }
 
 pub(super) fn state(
     summary: &Summary,
-    meter: &Meter,
+    mpixel_per_s: f64,
     room: &WaitingRoom,
     left: &AtomicU64,
 ) -> State {
@@ -383,7 +390,7 @@ pub(super) fn state(
         queued: left.load(Ordering::Relaxed),
         waiting: room.len(),
         quarantined: summary.quarantined,
-        mpixel_per_s: meter.mpixel_per_s(),
+        mpixel_per_s,
     }
 }
 

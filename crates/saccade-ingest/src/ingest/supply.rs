@@ -2,15 +2,14 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::SystemTime;
 
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{Cursor, Record, RecordLine, RecordReader, TileRecord};
-use saccade_archive::catalog::{Claim, Quarantined, Waiting, Worker};
+use saccade_archive::catalog::{Claim, Waiting, Worker};
 
-use super::enter::{Done, Ready, retry};
+use super::enter::{Done, Ready};
 use super::images::Images;
-use super::prepare::{Context, Outcome, quarantine};
+use super::prepare::{Context, Outcome, Unfit, quarantine};
 use super::records::patiently;
 use super::run::Summary;
 use super::waiting::Due;
@@ -67,20 +66,20 @@ impl Supply<'_> {
             // Should it end this worker, it is known to have been in hand.
             let (catalog, volume) = (self.archive.catalog(), self.context.volume);
             let begin = || catalog.begin_record(volume, self.worker, position);
-            retry(self.options, self.context.progress, begin).await?;
+            self.context.retry(begin).await?;
         }
         Ok(job)
     }
 
     async fn claim(&mut self) -> Result<usize, IngestError> {
-        let (options, progress) = (self.options, self.context.progress);
+        let options = self.options;
         // A few more than are worked on at once: each claim is a question to the catalog, but what is
         // claimed and waits is nobody else's.
         let most = (4 * options.workers.max(1)).min(self.budget);
         let most = u32::try_from(most).unwrap_or(u32::MAX);
         let (catalog, volume) = (self.archive.catalog(), self.context.volume);
         let claim = || catalog.claim(volume, self.worker, most);
-        let claims = retry(options, progress, claim).await?;
+        let claims = self.context.retry(claim).await?;
         let claimed = claims.len();
         if claimed > 0 {
             // Somebody may have read them from another acquisition since this one last looked.
@@ -103,11 +102,12 @@ impl Supply<'_> {
     async fn catch_up(&mut self) -> Result<Cursor, IngestError> {
         let (options, progress) = (self.options, self.context.progress);
         let (catalog, volume) = (self.archive.catalog(), self.context.volume);
-        let from = retry(options, progress, || catalog.cursor(volume)).await?;
+        let from = self.context.retry(|| catalog.cursor(volume)).await?;
         if self.reader.cursor() != from {
             *self.reader = self.reader.at(from);
         }
-        patiently(options, progress, || self.reader.recognize()).await?;
+        let clock = catalog.clock();
+        patiently(clock, options, progress, || self.reader.recognize()).await?;
         Ok(from)
     }
 
@@ -119,18 +119,19 @@ impl Supply<'_> {
         let batch = options.batch.max(1);
         // Another worker may have read on.
         let from = self.catch_up().await?;
-        let (queued, _) = retry(options, progress, || catalog.queued(volume)).await?;
+        let (queued, _) = self.context.retry(|| catalog.queued(volume)).await?;
         if queued >= batch as u64 {
             return Ok(false);
         }
-        let lines = patiently(options, progress, || self.reader.read(batch)).await?;
+        let clock = catalog.clock();
+        let lines = patiently(clock, options, progress, || self.reader.read(batch)).await?;
         self.blocked = false;
         if lines.is_empty() {
             self.left.store(queued, Ordering::Relaxed);
             return Ok(false);
         }
         let lines: Vec<_> = lines.into_iter().map(|l| (l.next, New::from(l))).collect();
-        let (taken, done) = retry(options, progress, async || {
+        let ask = async || {
             let mut commit = catalog.begin(volume).await?;
             let mut done = Done::default();
             let (mut taken, mut to) = (0, from);
@@ -143,7 +144,7 @@ impl Supply<'_> {
                         if tile.is_some() && commit.is_queued(tile.unwrap_or_default()).await? {
                             break;
                         }
-                        done.apply(&mut commit, outcome).await?;
+                        done.apply(&mut commit, outcome, clock.now()).await?;
                     }
                 }
                 (taken, to) = (taken + 1, *next);
@@ -153,8 +154,8 @@ impl Supply<'_> {
             }
             commit.finish().await?;
             Ok((taken, done))
-        })
-        .await?;
+        };
+        let (taken, done) = self.context.retry(ask).await?;
         self.context.set_aside.note(done.changes);
         self.blocked = taken < lines.len();
         for notice in &done.notices {
@@ -191,7 +192,7 @@ impl From<RecordLine> for New {
             Ok(Record::Delete(record)) => Self::Done(Outcome::Delete { record, position }),
             Err(broken) => {
                 // By the image, if the line names one: that is what people look for.
-                let what = Quarantined {
+                let what = Unfit {
                     file: broken
                         .file
                         .clone()
@@ -199,7 +200,6 @@ impl From<RecordLine> for New {
                     tile: broken.tile.clone(),
                     reason: format!("{broken}; append the record again as it should be"),
                     bytes: Some(line.next.offset - line.offset),
-                    at: SystemTime::now(),
                 };
                 Self::Done(Outcome::Quarantine {
                     what,

@@ -1,64 +1,10 @@
-//! Time, real or pretended, and a pace to keep.
+//! Time, and a pace to keep.
 
-use std::sync::Mutex;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+pub use saccade_archive::clock::{Clock, PretendClock, SystemClock};
 
 use crate::Cancel;
-
-/// Time that can be read and waited for.
-pub trait Clock: Send + Sync {
-    /// Time since some fixed moment.
-    fn now(&self) -> Duration;
-    /// Returns after `duration`.
-    fn sleep(&self, duration: Duration);
-}
-
-/// The computer's monotonic clock.
-#[derive(Debug)]
-pub struct SystemClock {
-    start: Instant,
-}
-
-impl Default for SystemClock {
-    fn default() -> Self {
-        #[expect(
-            clippy::disallowed_methods,
-            reason = "simulators and archives are native only"
-        )]
-        let start = Instant::now();
-        Self { start }
-    }
-}
-
-impl Clock for SystemClock {
-    fn now(&self) -> Duration {
-        self.start.elapsed()
-    }
-    fn sleep(&self, duration: Duration) {
-        std::thread::sleep(duration);
-    }
-}
-
-/// A clock that only moves when somebody sleeps: an hour passes at once.
-#[derive(Debug, Default)]
-pub struct PretendClock {
-    now: Mutex<Duration>,
-}
-
-impl Clock for PretendClock {
-    fn now(&self) -> Duration {
-        *self
-            .now
-            .lock()
-            .expect("nothing panics while holding the time")
-    }
-    fn sleep(&self, duration: Duration) {
-        *self
-            .now
-            .lock()
-            .expect("nothing panics while holding the time") += duration;
-    }
-}
 
 /// Keeps to a rate. Time lost is not caught up with, as a microscope would not.
 #[derive(Debug)]
@@ -89,17 +35,17 @@ impl Pace {
 
     /// Waits until `duration` after the end of the last wait; `false` if cancelled meanwhile.
     pub(crate) fn pause(&mut self, clock: &dyn Clock, duration: Duration, cancel: &Cancel) -> bool {
-        let due = self.due.unwrap_or_else(|| clock.now()) + duration;
+        let due = self.due.unwrap_or_else(|| clock.monotonic()) + duration;
         loop {
             if cancel.is_cancelled() {
                 return false;
             }
-            let now = clock.now();
+            let now = clock.monotonic();
             if now >= due {
                 self.due = Some(now.max(due));
                 return true;
             }
-            clock.sleep(SLICE.min(due - now));
+            clock.block(SLICE.min(due - now));
         }
     }
 }

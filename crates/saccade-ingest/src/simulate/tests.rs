@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::sync::Mutex;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
+use futures::future::BoxFuture;
 use glam::{DVec2, DVec3, UVec2, UVec3};
 use saccade_archive::acquisition::{AcquisitionInfo, Cursor, RecordReader};
 use saccade_core::transform::{SectionFromTile, SectionPoint, TilePoint};
@@ -38,7 +39,7 @@ fn acquire(config: &SimulateConfig) -> (TempDir, SimulateSummary) {
         config,
         &stack(),
         folder.path(),
-        &SystemClock::default(),
+        &SystemClock,
         &Cancel::new(),
         &(),
     );
@@ -272,7 +273,7 @@ fn archives_depend_on_the_settings_alone() {
         "rate and threads change nothing"
     );
 
-    let took = clock.now().as_secs_f64();
+    let took = clock.monotonic().as_secs_f64();
     let want = summary.pixels as f64 / 0.5e6;
     assert!(
         (took - want).abs() < 1e-3,
@@ -301,13 +302,25 @@ struct Watched<'a> {
     at_sleep: Box<dyn Fn() + Send + Sync + 'a>,
 }
 
+impl std::fmt::Debug for Watched<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.inner.fmt(f)
+    }
+}
+
 impl Clock for Watched<'_> {
-    fn now(&self) -> Duration {
+    fn now(&self) -> SystemTime {
         self.inner.now()
     }
-    fn sleep(&self, duration: Duration) {
+    fn monotonic(&self) -> Duration {
+        self.inner.monotonic()
+    }
+    fn sleep(&self, duration: Duration) -> BoxFuture<'_, ()> {
+        self.inner.sleep(duration)
+    }
+    fn block(&self, duration: Duration) {
         (self.at_sleep)();
-        self.inner.sleep(duration);
+        self.inner.block(duration);
     }
 }
 

@@ -1,3 +1,5 @@
+use std::time::SystemTime;
+
 use glam::{DVec2, DVec3, UVec2, UVec3};
 use saccade_archive::acquisition::Cursor;
 use saccade_archive::catalog::NewTile;

@@ -3,6 +3,8 @@
 use std::error::Error;
 use std::time::Duration;
 
+use saccade_archive::clock::{Clock as _, SystemClock};
+
 use super::Next;
 use crate::held_up::{HeldUp, Part};
 use crate::words::with_causes;
@@ -76,7 +78,7 @@ pub(super) fn look_on<L: Looks>(
                 told += new;
                 watch
                     .held_up()
-                    .tell(Part::Watch, watch.waits_for().as_deref());
+                    .tell(Part::Watch, watch.waits_for().as_deref(), SystemClock.now());
                 match next {
                     _ if known(watch) => break,
                     Next::More => continue,
@@ -94,7 +96,9 @@ pub(super) fn look_on<L: Looks>(
                     return Err(e);
                 }
                 let what = with_causes(&e);
-                watch.held_up().tell(Part::Watch, Some(&what));
+                watch
+                    .held_up()
+                    .tell(Part::Watch, Some(&what), SystemClock.now());
                 if what != said || failures.is_multiple_of(SAY_AGAIN) {
                     log::warn!("{what}; trying again");
                     said = what;
@@ -105,7 +109,7 @@ pub(super) fn look_on<L: Looks>(
         let mut left = watch.poll();
         while !left.is_zero() && !cancel.is_cancelled() {
             let nap = left.min(Duration::from_millis(50));
-            std::thread::sleep(nap);
+            SystemClock.block(nap);
             left -= nap;
         }
     }

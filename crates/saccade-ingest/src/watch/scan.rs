@@ -7,6 +7,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+use saccade_archive::clock::{Clock as _, SystemClock};
+
 use super::again::Again;
 use super::stamp::Seen;
 use super::{Pattern, Place, Stamp};
@@ -80,7 +82,7 @@ impl Folders for Disk {
     }
 
     fn now(&self) -> SystemTime {
-        SystemTime::now()
+        SystemClock.now()
     }
 }
 

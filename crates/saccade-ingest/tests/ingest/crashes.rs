@@ -5,26 +5,31 @@
 //! runs over the disk, and ingest's own order of storage and catalog; a commit of the catalog, which
 //! is SQLite's matter, counts as kept whole.
 //!
+//! Times and identities come from the seed, too: time passes as much as is drawn with each write, and as long as leases
+//! last with each power cut. So a seed says all that there is to be seen.
+//!
 //! `SACCADE_CRASH_SEED=SEED` repeats a run, `SACCADE_CRASH_SEED=SEED:HISTORY` one of its histories.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::hash::{BuildHasher, RandomState};
+use std::hash::{BuildHasher, Hash};
 use std::io::Write;
 use std::path::Path;
 use std::pin::pin;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use futures::FutureExt as _;
 use futures::future::{BoxFuture, Either, select};
 use glam::UVec2;
-use saccade_archive::VisualizationArchive;
-use saccade_archive::catalog::Catalog;
+use saccade_archive::catalog::{Catalog, Retired};
+use saccade_archive::clock::{Clock as _, PretendClock};
+use saccade_archive::randomness::{Randomness, SeededRandomness, SystemRandomness};
 use saccade_archive::storage::{
     Crash, DirEntry, Disk, Entry, LocalStorage, Metadata, OpenFile, SimulatedDisk, Storage,
     StorageError,
 };
+use saccade_archive::{ArchiveLocation, IDENTITY, VisualizationArchive, read_identity};
 use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, run};
 
@@ -37,6 +42,10 @@ const STATES: u64 = 120;
 /// What one run of the test looks at, at least.
 const AT_LEAST: usize = 10_000;
 const ROOT: &str = "archive";
+/// Longer than any life.
+const LEASE: Duration = Duration::from_secs(3600);
+/// What a write takes at most \[ms\].
+const LONGEST_WRITE: u64 = 20;
 
 #[tokio::test]
 async fn no_power_cut_loses_what_was_acknowledged() {
@@ -58,11 +67,12 @@ async fn no_power_cut_loses_what_was_acknowledged() {
         }
     }
     let said = format!(
-        "{} states after {} power cuts, {} of them different, {} with acknowledged tiles\n",
+        "{} states after {} power cuts, {} of them different, {} with acknowledged tiles; all in one number: {:016x}\n",
         found.states,
         found.cuts,
         found.different.len(),
-        found.with_tiles
+        found.with_tiles,
+        found.digest
     );
     stderr().write_all(said.as_bytes()).unwrap();
     if only.is_none() {
@@ -72,35 +82,60 @@ async fn no_power_cut_loses_what_was_acknowledged() {
     }
 }
 
+/// A history that cannot be repeated helps nobody who looks for what went wrong in it.
+#[tokio::test]
+async fn a_seed_repeats_everything_that_is_seen() {
+    const FEW: u64 = 4;
+    let scene = Scene::new().await;
+    let seen = async |seed| {
+        let mut found = Found::default();
+        for history in 0..FEW {
+            let lived = scene.history(seed, history, &sound, &mut found).await;
+            lived.unwrap_or_else(|wrong| panic!("{wrong}\nseed {seed}, history {history}"));
+        }
+        assert!(found.cuts > 4 && found.retired > 0, "{found:?}");
+        found
+    };
+    let once = seen(5).await;
+    assert_eq!(once, seen(5).await);
+    assert_ne!(once.digest, seen(6).await.digest);
+}
+
 /// A suite that cannot fail proves nothing.
 #[tokio::test]
 async fn storages_that_leave_a_step_out_are_found_out() {
     let scene = Scene::new().await;
     let lax: [(&str, &Open); 4] = [
-        ("files are not synced", &|disk| {
-            on(Lax {
+        ("files are not synced", &|disk, randomness| {
+            let lax = Lax {
                 disk,
                 files: false,
                 folders: true,
-            })
+            };
+            on(lax, randomness)
         }),
-        ("folders are not synced", &|disk| {
-            on(Lax {
+        ("folders are not synced", &|disk, randomness| {
+            let lax = Lax {
                 disk,
                 files: true,
                 folders: false,
-            })
+            };
+            on(lax, randomness)
         }),
-        ("files are written under their own names", &|disk| {
-            on(Naming { disk })
-        }),
-        ("writes are acknowledged before they are done", &|disk| {
-            let inner = sound(disk)?;
-            Ok(Arc::new(Hasty {
-                inner,
-                promised: Mutex::default(),
-            }))
-        }),
+        (
+            "files are written under their own names",
+            &|disk, randomness| on(Naming { disk }, randomness),
+        ),
+        (
+            "writes are acknowledged before they are done",
+            &|disk, randomness| {
+                let inner = sound(disk, randomness)?;
+                Ok(Arc::new(Hasty {
+                    inner,
+                    promised: Mutex::default(),
+                }))
+            },
+        ),
     ];
     for (what, open) in lax {
         let mut found = Found::default();
@@ -127,7 +162,7 @@ fn asked_for() -> (u64, Option<u64>) {
             .expect("SACCADE_CRASH_SEED is SEED or SEED:HISTORY")
     };
     match std::env::var("SACCADE_CRASH_SEED") {
-        Err(_) => (RandomState::new().hash_one(0) % 1_000_000_000, None),
+        Err(_) => (SystemRandomness.next() % 1_000_000_000, None),
         Ok(text) => match text.split_once(':') {
             None => (number(&text), None),
             Some((seed, history)) => (number(seed), Some(number(history))),
@@ -135,18 +170,21 @@ fn asked_for() -> (u64, Option<u64>) {
     }
 }
 
-type Open = dyn Fn(SimulatedDisk) -> Result<Arc<dyn Storage>, StorageError>;
+type Draws = Arc<dyn Randomness>;
 
-fn on(disk: impl Disk + 'static) -> Result<Arc<dyn Storage>, StorageError> {
-    Ok(Arc::new(LocalStorage::on(Arc::new(disk), ROOT)?))
+type Open = dyn Fn(SimulatedDisk, Draws) -> Result<Arc<dyn Storage>, StorageError>;
+
+fn on(disk: impl Disk + 'static, randomness: Draws) -> Result<Arc<dyn Storage>, StorageError> {
+    let storage = LocalStorage::on(Arc::new(disk), ROOT)?;
+    Ok(Arc::new(storage.with_randomness(randomness)))
 }
 
-fn sound(disk: SimulatedDisk) -> Result<Arc<dyn Storage>, StorageError> {
-    on(disk)
+fn sound(disk: SimulatedDisk, randomness: Draws) -> Result<Arc<dyn Storage>, StorageError> {
+    on(disk, randomness)
 }
 
 /// What was looked at.
-#[derive(Default)]
+#[derive(Debug, Default, PartialEq)]
 struct Found {
     states: usize,
     cuts: usize,
@@ -154,6 +192,24 @@ struct Found {
     with_tiles: usize,
     /// Trees of files.
     different: BTreeSet<u64>,
+    /// Pyramids that were found on the list of those to be deleted.
+    retired: usize,
+    /// All that was seen.
+    digest: u64,
+}
+
+impl Found {
+    fn note(&mut self, seen: impl Hash) {
+        self.digest = FIXED.hash_one((self.digest, seen));
+    }
+}
+
+/// What is around a history, all of it from the seed.
+struct World {
+    clock: Arc<PretendClock>,
+    randomness: Draws,
+    /// What messages call the archive.
+    location: ArchiveLocation,
 }
 
 /// An acquisition, and what becomes of it when nothing happens.
@@ -181,6 +237,7 @@ impl Scene {
             batch: 1,
             workers: 1,
             keep_retired: Duration::ZERO,
+            lease: LEASE,
             ..quick()
         };
         let folder = tempfile::tempdir().unwrap();
@@ -214,33 +271,50 @@ impl Scene {
         open: &Open,
         found: &mut Found,
     ) -> Result<(), String> {
-        let mut chance = Chance(seed.wrapping_mul(1_000_003).wrapping_add(history));
+        let seed = seed.wrapping_mul(1_000_003).wrapping_add(history);
+        let mut chance = Chance(seed);
         let folder = tempfile::tempdir().unwrap();
+        let world = World {
+            clock: Arc::default(),
+            randomness: Arc::new(SeededRandomness::new(seed)),
+            location: folder.path().into(),
+        };
         let mut disk = SimulatedDisk::new();
         for life in 0.. {
             let path = folder.path().join("catalog.sqlite");
-            let catalog = Catalog::create(&path).await.map_err(|e| e.to_string())?;
+            let catalog = Catalog::create(path.as_path()).await;
+            let catalog = catalog.map_err(|e| e.to_string())?;
+            let catalog = catalog.with_clock(world.clock.clone());
             disk.cut_power_at(chance.below(if life < 6 { 45 } else { 1000 }));
-            let ended = self.live(&catalog, &disk, open).await;
+            let ended = self.live(&world, &catalog, &disk, open).await;
             if let Some(ended) = ended {
                 ended.map_err(|e| format!("life {life}: {e}"))?;
                 disk.cut_power_at(1 << 40);
                 let archive = VisualizationArchive::from_parts(
                     catalog,
-                    open(disk.clone()).map_err(|e| e.to_string())?,
+                    open(disk.clone(), world.randomness.clone()).map_err(|e| e.to_string())?,
                 );
+                found.note((disk.tree(), world.clock.now()));
                 return self.is_complete(&archive, &disk).await;
             }
             catalog.close().await;
-            let named = named(folder.path()).await;
+            // The claims of the dead are free.
+            world.clock.turn(2 * LEASE);
+            let known = Known::of(folder.path()).await;
             found.cuts += 1;
+            found.retired += known.retired.len();
+            found.note((&known, disk.steps(), world.clock.now()));
             let mut next = None;
             for state in 0..STATES {
                 let left = disk.after_crash(&mut Crash::new(chance.next()));
                 found.states += 1;
-                found.with_tiles += usize::from(!named.is_empty());
-                found.different.insert(FIXED.hash_one(left.tree()));
-                self.is_whole(&named, &left)
+                found.with_tiles += usize::from(!known.named.is_empty());
+                let tree = FIXED.hash_one(left.tree());
+                found.different.insert(tree);
+                found.note(tree);
+                known
+                    .is_the_storages(&left)
+                    .and_then(|()| self.is_whole(&known.named, &left))
                     .map_err(|e| format!("life {life}, state {state}: {e}"))?;
                 next = Some(left);
             }
@@ -252,13 +326,23 @@ impl Scene {
     /// Ingests until the end, or until the power is cut: then `None`.
     async fn live(
         &self,
+        world: &World,
         catalog: &Catalog,
         disk: &SimulatedDisk,
         open: &Open,
     ) -> Option<Result<(), String>> {
         let work = async {
-            let storage = open(disk.clone()).map_err(|e| e.to_string())?;
-            let archive = VisualizationArchive::from_parts(catalog.clone(), storage);
+            let randomness = &world.randomness;
+            let inner = open(disk.clone(), randomness.clone()).map_err(|e| e.to_string())?;
+            let storage = Arc::new(Slow {
+                inner,
+                clock: world.clock.clone(),
+                randomness: randomness.clone(),
+            });
+            let archive = VisualizationArchive::from_parts(catalog.clone(), storage)
+                .with_randomness(randomness.clone());
+            let made = archive.identify(&world.location).await;
+            made.map_err(|e| format!("{e:?}"))?;
             let cancel = Cancel::new();
             let ingest = run(self.scope.path(), &archive, &self.options, &(), &cancel);
             ingest.await.map_err(|e| format!("{e:?}")).map(|_| ())
@@ -316,20 +400,55 @@ impl Scene {
 const FIXED: std::hash::BuildHasherDefault<std::hash::DefaultHasher> =
     std::hash::BuildHasherDefault::new();
 
-/// The pyramids that the catalog in a folder names.
-async fn named(folder: &Path) -> Vec<String> {
-    let catalog = Catalog::create(&folder.join("catalog.sqlite"))
-        .await
-        .unwrap();
-    let mut named = Vec::new();
-    if catalog.volume(VOLUME).await.is_ok() {
-        for z in catalog.sections(VOLUME).await.unwrap() {
-            let tiles = catalog.section_tiles(VOLUME, z).await.unwrap();
-            named.extend(tiles.into_iter().map(|tile| tile.pyramid));
+/// What a catalog says after a power cut.
+#[derive(Debug, Hash)]
+struct Known {
+    identity: Option<String>,
+    /// Pyramids that tiles name.
+    named: Vec<String>,
+    /// Those that are to be deleted, and since when nothing names them.
+    retired: Vec<(String, SystemTime)>,
+}
+
+impl Known {
+    /// That of the catalog in a folder.
+    async fn of(folder: &Path) -> Self {
+        let path = folder.join("catalog.sqlite");
+        let catalog = Catalog::create(path.as_path()).await.unwrap();
+        let mut known = Self {
+            identity: catalog.identity().await.unwrap(),
+            named: Vec::new(),
+            retired: Vec::new(),
+        };
+        if catalog.volume(VOLUME).await.is_ok() {
+            for z in catalog.sections(VOLUME).await.unwrap() {
+                let tiles = catalog.section_tiles(VOLUME, z).await.unwrap();
+                known
+                    .named
+                    .extend(tiles.into_iter().map(|tile| tile.pyramid));
+            }
+            let ever = SystemTime::UNIX_EPOCH + Duration::from_secs(1 << 32);
+            let retired = catalog.retired(VOLUME, ever, 99).await.unwrap();
+            let entry = |Retired { pyramid, at, .. }| (pyramid, at);
+            known.retired.extend(retired.into_iter().map(entry));
+        }
+        catalog.close().await;
+        known
+    }
+
+    /// The identity is the same in the storage, once there are tiles.
+    fn is_the_storages(&self, disk: &SimulatedDisk) -> Result<(), String> {
+        if self.named.is_empty() {
+            return Ok(());
+        }
+        let read = disk.read(&Path::new(ROOT).join(IDENTITY), None);
+        let read = read.map_err(|e| format!("the identity is lost: {e}"))?;
+        if read_identity(&read) == self.identity && self.identity.is_some() {
+            Ok(())
+        } else {
+            Err(format!("the identity is {read:?}, not {:?}", self.identity))
         }
     }
-    catalog.close().await;
-    named
 }
 
 /// A small generator.
@@ -438,6 +557,46 @@ delegate_disk!(Naming {
         self.disk.sync_dir(path)
     }
 });
+
+/// Takes a while for each write.
+#[derive(Debug)]
+struct Slow {
+    inner: Arc<dyn Storage>,
+    clock: Arc<PretendClock>,
+    randomness: Draws,
+}
+
+impl Storage for Slow {
+    fn read<'a>(
+        &'a self,
+        name: &'a str,
+        range: Option<std::ops::Range<u64>>,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        self.inner.read(name, range)
+    }
+
+    fn write_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<(), StorageError>> {
+        let millis = 1 + self.randomness.next() % LONGEST_WRITE;
+        self.clock.turn(Duration::from_millis(millis));
+        self.inner.write_durable(name, bytes)
+    }
+
+    fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+        self.inner.entries(prefix)
+    }
+
+    fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
+        self.inner.delete(name)
+    }
+
+    fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
+        self.inner.size(name)
+    }
+}
 
 /// Does each write when the next one comes.
 #[derive(Debug)]

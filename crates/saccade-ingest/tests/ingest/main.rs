@@ -1,6 +1,10 @@
 //! Ingest as a whole: what arrives, what is refused, what fails, what is killed.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests are tests")]
+#![allow(
+    clippy::disallowed_methods,
+    reason = "tests also wait for what really happens"
+)]
 
 mod bare;
 mod crashes;
@@ -11,6 +15,7 @@ mod lists;
 mod mended;
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;
+mod pretended;
 mod quarantine;
 mod replaced;
 mod scope;

@@ -76,7 +76,7 @@ impl Subject {
         cancel: &Cancel,
         progress: &dyn Progress,
     ) -> Result<SimulateSummary> {
-        let clock = SystemClock::default();
+        let clock = SystemClock;
         Ok(match self {
             Self::Tissue { stack, config } => {
                 simulate(config, &**stack, out, &clock, cancel, progress)?

@@ -4,6 +4,7 @@ use std::fs::{self, File};
 
 use super::super::SimulatedDisk;
 use super::*;
+use crate::randomness::SeededRandomness;
 
 #[tokio::test]
 async fn conforms() {
@@ -127,24 +128,24 @@ async fn a_failed_write_leaves_nothing_behind() {
 #[tokio::test]
 async fn temporaries_of_others_are_neither_touched_nor_in_the_way() {
     let dir = tempfile::tempdir().unwrap();
+    let [ours, theirs] = [(); 2].map(|()| Arc::new(SeededRandomness::new(7)));
     let storage = LocalStorage::new(dir.path()).unwrap();
+    let storage = storage.with_randomness(ours);
     let incoming = dir.path().join(INCOMING);
-    // The same process number on another machine: the next names are all taken.
+    // Whatever the odds: the next names are all taken.
     let write = || storage.write_durable("a", Bytes::from_static(b"ours"));
     write().await.unwrap();
-    let next = NEXT.load(Ordering::Relaxed);
-    for number in next..next + 60 {
-        fs::write(
-            incoming.join(format!("{}-{number}", std::process::id())),
-            b"theirs",
-        )
-        .unwrap();
+    theirs.next();
+    for _ in 0..60 {
+        let name = format!("{:016x}", theirs.next());
+        fs::write(incoming.join(name), b"theirs").unwrap();
     }
     write().await.unwrap();
     assert_eq!(storage.read("a", None).await.unwrap(), b"ours"[..]);
     for entry in fs::read_dir(&incoming).unwrap() {
         assert_eq!(fs::read(entry.unwrap().path()).unwrap(), b"theirs");
     }
+    assert_eq!(fs::read_dir(&incoming).unwrap().count(), 60);
 }
 
 #[tokio::test]

@@ -28,7 +28,7 @@ async fn is_as_replayed(folder: &Path) -> usize {
         rate_mpixel_s: None,
         solution_after: Duration::ZERO,
     };
-    let (cancel, clock) = (Cancel::new(), SystemClock::default());
+    let (cancel, clock) = (Cancel::new(), SystemClock);
     let second = beside.path().join("replayed");
     replay::run(&replayed, &acquisition, &second, &clock, &cancel, &()).unwrap();
     let want = archive(&beside.path().join("want")).await;
