@@ -68,7 +68,7 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionEr
                 "a tile comes before `dim = 2` or `dim = 3`".into(),
             ));
         };
-        tiles.push(tile(text, dimensions).map_err(|reason| wrong(line, reason))?);
+        tiles.push(tile(text, dimensions, line).map_err(|reason| wrong(line, reason))?);
     }
     match dimensions {
         Some(_) => Ok(tiles),
@@ -90,7 +90,7 @@ fn setting(text: &str) -> Option<(&str, &str)> {
     (!text.contains(';')).then(|| (name.trim(), value.trim()))
 }
 
-fn tile(text: &str, dimensions: usize) -> Result<ListedTile, String> {
+fn tile(text: &str, dimensions: usize, line: u64) -> Result<ListedTile, String> {
     let form = || format!("{} is not `file; ; (x, y)`", quoted(text));
     let (rest, position) = text.rsplit_once(';').ok_or_else(form)?;
     // Between the semicolons stands the series within the file.
@@ -113,6 +113,7 @@ fn tile(text: &str, dimensions: usize) -> Result<ListedTile, String> {
         file: file.trim().to_owned(),
         corner: DVec2::new(numbers[0], numbers[1]),
         section,
+        line,
     })
 }
 

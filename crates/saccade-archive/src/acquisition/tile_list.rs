@@ -18,6 +18,8 @@ pub struct ListedTile {
     pub corner: DVec2,
     /// Section: z index, possibly not starting at 0.
     pub section: u32,
+    /// Its line in the list, from 1.
+    pub line: u64,
 }
 
 impl ListedTile {
@@ -28,7 +30,7 @@ impl ListedTile {
 }
 
 /// File name without folder and extension; either slash separates folders.
-pub(super) fn stem(file: &str) -> &str {
+pub fn stem(file: &str) -> &str {
     let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
     name.rsplit_once('.')
         .map_or(name, |(stem, _)| if stem.is_empty() { name } else { stem })
@@ -65,7 +67,7 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionEr
         if tiles.is_empty() && is_header(text) {
             continue;
         }
-        tiles.push(listed(text).map_err(|reason| AcquisitionError::Line {
+        tiles.push(listed(text, line).map_err(|reason| AcquisitionError::Line {
             line,
             reason,
             path: path.to_owned(),
@@ -105,7 +107,7 @@ fn is_header(text: &str) -> bool {
     columns(text).is_some_and(named)
 }
 
-fn listed(text: &str) -> Result<ListedTile, String> {
+fn listed(text: &str, line: u64) -> Result<ListedTile, String> {
     let [file, x, y, z] =
         columns(text).ok_or_else(|| format!("{} is not `file x y z`", quoted(text)))?;
     let number = |what: &str, text: &str| match text.parse::<f64>() {
@@ -127,6 +129,7 @@ fn listed(text: &str) -> Result<ListedTile, String> {
         file: file.to_owned(),
         corner,
         section,
+        line,
     })
 }
 

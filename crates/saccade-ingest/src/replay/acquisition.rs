@@ -6,14 +6,14 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec2, UVec2, UVec3};
-use saccade_archive::acquisition::tile_list::{Images, ListedTile};
+use saccade_archive::acquisition::tile_list::Images;
 use saccade_archive::image::{Wanted, decode_file_as, read_bits};
 use saccade_core::transform::{SectionFromTile, TilePoint};
 use saccade_core::volume::Dtype;
 use tiff::decoder::Decoder;
 
 use super::ReplayError;
-use super::lists::{self, Solution};
+use super::lists::{self, Listed, Solution};
 use crate::simulate::settings::Fingerprint;
 use crate::simulate::stack::volume_name;
 
@@ -22,6 +22,8 @@ use crate::simulate::stack::volume_name;
 pub struct RawTile {
     /// Name, unique in the acquisition.
     pub name: String,
+    /// What solutions call it.
+    pub known_as: String,
     /// Its file.
     pub image: PathBuf,
     /// Section: z index, from 0.
@@ -68,6 +70,7 @@ impl Acquisition {
     /// [`ReplayError`].
     pub fn open(folder: &Path, list: &Path, solution: Option<&Path>) -> Result<Self, ReplayError> {
         let listed = lists::read(list)?;
+        listed.say_notes();
         let images = Images::below(folder)?;
         let named = solution.map(Solution::read).transpose()?;
         let solution = named.or(listed.solution);
@@ -78,7 +81,7 @@ impl Acquisition {
         folder: &Path,
         images: &Images,
         list: &Path,
-        listed: &[ListedTile],
+        listed: &[Listed],
         solution: Option<&Solution>,
     ) -> Result<Self, ReplayError> {
         let names = unique_names(listed);
@@ -111,11 +114,12 @@ impl Acquisition {
             }
             tiles.push(RawTile {
                 name,
+                known_as: tile.known_as.clone(),
                 size,
                 image,
                 section: tile.section - first_section,
                 stage: SectionFromTile::translation(tile.corner),
-                aligned: solution.and_then(|s| s.transforms.get(tile.name()).copied()),
+                aligned: solution.and_then(|s| s.transforms.get(&tile.known_as).copied()),
             });
         }
         tiles.sort_by_key(|tile| tile.section);
@@ -162,8 +166,8 @@ impl Acquisition {
 }
 
 /// The files' names without folders, or with them where that is ambiguous.
-fn unique_names(listed: &[ListedTile]) -> Vec<String> {
-    let distinct: BTreeSet<&str> = listed.iter().map(ListedTile::name).collect();
+fn unique_names(listed: &[Listed]) -> Vec<String> {
+    let distinct: BTreeSet<&str> = listed.iter().map(Listed::stem).collect();
     let safe = |text: &str| -> String {
         let fit = |c: char| {
             if c.is_alphanumeric() || "-_.".contains(c) {
@@ -175,13 +179,13 @@ fn unique_names(listed: &[ListedTile]) -> Vec<String> {
         text.chars().map(fit).collect()
     };
     if distinct.len() == listed.len() {
-        return listed.iter().map(|tile| safe(tile.name())).collect();
+        return listed.iter().map(|tile| safe(tile.stem())).collect();
     }
-    // The place in the list makes even a tile listed twice two tiles.
+    // The place in the list tells those of one name apart.
     listed
         .iter()
         .enumerate()
-        .map(|(n, tile)| format!("{n:05}_{}", safe(tile.name())))
+        .map(|(n, tile)| format!("{n:05}_{}", safe(tile.stem())))
         .collect()
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use saccade_archive::acquisition::tile_list::{Images, ListedTile};
+use saccade_archive::acquisition::tile_list::Images;
 use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, is_inside, trakem2};
 
 use super::acquisition::median_offset;
@@ -214,7 +214,10 @@ pub fn find_list(folder: &Path) -> Result<Option<PathBuf>, ReplayError> {
 fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, ReplayError> {
     let images = Images::below(folder)?;
     match chosen(tree, &images)? {
-        Some((list, listed, true)) => with_solution(folder, tree, &images, &list, listed).map(Some),
+        Some((list, listed, true)) => {
+            listed.say_notes();
+            with_solution(folder, tree, &images, &list, listed).map(Some)
+        }
         // Says which images are missing.
         Some((list, listed, false)) => {
             Acquisition::new(folder, &images, &list, &listed.tiles, None).map(Some)
@@ -325,7 +328,7 @@ fn with_solution(
     list: &Path,
     listed: List,
 ) -> Result<Acquisition, ReplayError> {
-    let wanted: BTreeSet<&str> = listed.tiles.iter().map(ListedTile::name).collect();
+    let wanted: BTreeSet<&str> = listed.tiles.iter().map(|tile| &*tile.known_as).collect();
     let unsolved = Acquisition::new(folder, images, list, &listed.tiles, None)?;
     if wanted.len() < listed.tiles.len() {
         // Names that mean several tiles cannot be looked up in a solution.
@@ -379,7 +382,7 @@ fn refines(tiles: &[RawTile], solution: &Solution) -> bool {
     }
     let mut tiles = tiles.to_vec();
     for tile in &mut tiles {
-        tile.aligned = solution.transforms.get(&tile.name).copied();
+        tile.aligned = solution.transforms.get(&tile.known_as).copied();
     }
     let Some(offset) = median_offset(&tiles) else {
         return false;

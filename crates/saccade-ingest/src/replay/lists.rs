@@ -1,6 +1,6 @@
 //! Files that say where the tiles of an acquisition lie, whatever program wrote them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,12 +14,14 @@ use saccade_archive::acquisition::{
 };
 use saccade_core::transform::{SectionFromTile, TilePoint};
 
+mod twice;
+
 /// Where registration says that tiles lie.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Solution {
     /// The file that says so.
     pub(crate) path: PathBuf,
-    /// By the tiles' names.
+    /// By what it calls the tiles.
     pub(crate) transforms: BTreeMap<String, SectionFromTile>,
 }
 
@@ -46,10 +48,62 @@ impl Solution {
     }
 }
 
+/// A tile that a list names.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Listed {
+    /// The image as the list names it.
+    pub(crate) file: String,
+    /// What solutions call it: the image's name without folder and extension, unless the list has ids for several tiles of
+    /// that name.
+    pub(crate) known_as: String,
+    /// Low corner in its section \[pixels\].
+    pub(crate) corner: DVec2,
+    /// Section: z index, possibly not starting at 0.
+    pub(crate) section: u32,
+}
+
+impl Listed {
+    /// The image's name without folder and extension.
+    pub(crate) fn stem(&self) -> &str {
+        tile_list::stem(&self.file)
+    }
+}
+
+impl From<ListedTile> for Listed {
+    fn from(tile: ListedTile) -> Self {
+        Self {
+            known_as: tile.name().to_owned(),
+            file: tile.file,
+            corner: tile.corner,
+            section: tile.section,
+        }
+    }
+}
+
 /// Tiles with the places that the stage had for them, and what the same program says of them.
 pub(crate) struct List {
-    pub(crate) tiles: Vec<ListedTile>,
+    pub(crate) tiles: Vec<Listed>,
     pub(crate) solution: Option<Solution>,
+    /// What of it does not count, or otherwise than it is written, in words.
+    pub(crate) notes: Vec<String>,
+}
+
+impl List {
+    fn of_lines(tiles: Vec<ListedTile>, solution: Option<Solution>, path: &Path) -> Self {
+        let (tiles, note) = twice::lines_once(tiles, path);
+        Self {
+            tiles: tiles.into_iter().map(Listed::from).collect(),
+            solution,
+            notes: note.into_iter().collect(),
+        }
+    }
+
+    /// Says what of it does not count.
+    pub(crate) fn say_notes(&self) {
+        for note in &self.notes {
+            log::warn!("{note}");
+        }
+    }
 }
 
 /// Whether a file is what Fiji made of the list beside it.
@@ -66,17 +120,14 @@ pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("json"))
     {
-        return Ok(of_specs(path, &tile_specs::read(path)?));
+        return Ok(of_specs(path, tile_specs::read(path)?));
     }
     match tile_configuration::read(path) {
         Ok(tiles) => {
             let registered = tile_configuration::registered(path);
             // A pipe would be waited for.
             if path == registered || (registered.exists() && !registered.is_file()) {
-                return Ok(List {
-                    tiles,
-                    solution: None,
-                });
+                return Ok(List::of_lines(tiles, None, path));
             }
             refuse_link_out(&registered)?;
             let solution = match tile_configuration::read(&registered) {
@@ -88,14 +139,13 @@ pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
                 }
                 Err(error) => return Err(error),
             };
-            Ok(List { tiles, solution })
+            Ok(List::of_lines(tiles, solution, path))
         }
         Err(wrong) => match tile_list::read(path) {
             // An empty one is a list of no tiles, but no configuration.
-            Ok(tiles) if !tiles.is_empty() || !is_configuration(path) => Ok(List {
-                tiles,
-                solution: None,
-            }),
+            Ok(tiles) if !tiles.is_empty() || !is_configuration(path) => {
+                Ok(List::of_lines(tiles, None, path))
+            }
             Ok(_) => Err(wrong),
             Err(_) if is_configuration(path) => Err(wrong),
             Err(error) => Err(error),
@@ -156,8 +206,8 @@ pub(super) fn is_meant(path: &Path, images: &Images) -> bool {
 
 /// Whether a list that names no image that is there is one nevertheless, of images that were renamed or left
 /// behind.
-pub(super) fn is_certain(path: &Path, tiles: &[ListedTile]) -> bool {
-    let image = |tile: &ListedTile| {
+pub(super) fn is_certain(path: &Path, tiles: &[Listed]) -> bool {
+    let image = |tile: &Listed| {
         let name = tile.file.to_lowercase();
         let kinds = [".tif", ".tiff", ".png", ".jpg", ".jpeg"];
         kinds.iter().any(|kind| name.ends_with(kind))
@@ -206,23 +256,39 @@ fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
     }
 }
 
+/// What solutions call the tiles of specifications: by their images, but by their ids where several tiles have images of
+/// one name.
+fn known_as(specs: &[TileSpec]) -> Vec<String> {
+    let mut of_name: HashMap<&str, usize> = HashMap::new();
+    for spec in specs {
+        *of_name.entry(spec.name()).or_default() += 1;
+    }
+    let known_as = |spec: &TileSpec| match of_name[spec.name()] {
+        1 => spec.name().to_owned(),
+        _ => spec.id.clone(),
+    };
+    specs.iter().map(known_as).collect()
+}
+
 /// Of tiles that know no stage, or one that does not count pixels, the transform says roughly where it was.
-fn of_specs(path: &Path, specs: &[TileSpec]) -> List {
-    let counts = stage_counts_pixels(specs);
+fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
+    let (specs, note) = twice::specs_once(specs, path);
+    let mut notes = Vec::from_iter(note);
+    let counts = stage_counts_pixels(&specs);
     if !counts {
-        log::warn!(
+        notes.push(format!(
             "the stage's places (layout) are not in pixels, or other than the transforms', and are passed over: {}",
             path.display()
-        );
+        ));
     }
-    let tiles = specs.iter().map(|spec| ListedTile {
+    let known_as = known_as(&specs);
+    let tiles = specs.iter().zip(&known_as).map(|(spec, known_as)| Listed {
         file: spec.file.clone(),
+        known_as: known_as.clone(),
         corner: { spec.stage.filter(|_| counts) }.unwrap_or_else(|| transformed_corner(spec)),
         section: spec.section,
     });
-    let transforms = specs
-        .iter()
-        .map(|spec| (spec.name().to_owned(), spec.transform));
+    let tiles = tiles.collect();
     let mut left_out: Vec<&str> = specs
         .iter()
         .flat_map(|s| &s.left_out)
@@ -232,13 +298,19 @@ fn of_specs(path: &Path, specs: &[TileSpec]) -> List {
     left_out.dedup();
     if !left_out.is_empty() {
         let (kinds, path) = (left_out.join(", "), path.display());
-        log::warn!("only affine transforms are used; left out: {kinds}: {path}");
+        notes.push(format!(
+            "only affine transforms are used; left out: {kinds}: {path}"
+        ));
     }
+    let transforms = known_as.into_iter().zip(&specs);
     List {
-        tiles: tiles.collect(),
+        tiles,
         solution: Some(Solution {
             path: path.to_owned(),
-            transforms: transforms.collect(),
+            transforms: transforms
+                .map(|(name, spec)| (name, spec.transform))
+                .collect(),
         }),
+        notes,
     }
 }

@@ -137,6 +137,8 @@ pub struct ListWatch<F> {
     unsolved_said: usize,
     /// Whether it was said why a solution is not used.
     unused_said: bool,
+    /// What was said of the list as it was read last.
+    notes_said: Vec<String>,
     held_up: HeldUp,
     unread: VecDeque<Unread>,
     /// Records that could not be written yet.
@@ -200,6 +202,7 @@ impl<F: Folders> ListWatch<F> {
             dropping: None,
             unsolved_said: 0,
             unused_said: false,
+            notes_said: Vec::new(),
             held_up: HeldUp::default(),
             unread: VecDeque::new(),
             untold: VecDeque::new(),

@@ -4,6 +4,7 @@ mod power_cuts;
 mod refused;
 mod registration;
 mod replayed;
+mod twice;
 
 use std::collections::BTreeMap;
 use std::fs;

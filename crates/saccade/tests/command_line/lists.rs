@@ -219,6 +219,27 @@ fn what_a_list_cannot_say_or_change_is_told() {
     );
 }
 
+/// One who corrects a list sees which line counts, once.
+#[test]
+fn lines_that_name_an_image_again_are_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    picture(&scope, "a.png", 10);
+    let list = scope.join("list.txt");
+    std::fs::write(&list, "a.png 0 0 0\na.png 3 0 0\na.png 3 0 0\n").unwrap();
+    let ingest = ["ingest", text(&scope), text(&archive), "--once"];
+    let done = done([&ingest[..], &["--voxel", "4"]].concat());
+    let said = stderr(&done);
+    assert!(said.contains("1 tiles taken in"), "{said}");
+    for words in [
+        "line 2 puts \"a.png\" elsewhere than line 1",
+        "line 3 repeats line 2",
+    ] {
+        assert_eq!(said.matches(words).count(), 1, "{said}");
+    }
+}
+
 /// Those who look from elsewhere are told what it waits for, as long as it does.
 #[test]
 fn what_a_list_waits_for_is_in_its_status() {

@@ -41,7 +41,7 @@ impl<F: Folders> ListWatch<F> {
             State::Changed(age) => age,
         };
         (self.trouble, self.dropping) = (None, None);
-        let listing = match source::read(&self.config.list) {
+        let mut listing = match source::read(&self.config.list) {
             Ok(listing) if listing.tiles.is_empty() => {
                 self.trouble = Some(Trouble::Empty);
                 self.files.are_read();
@@ -50,6 +50,7 @@ impl<F: Folders> ListWatch<F> {
             Ok(listing) => listing,
             Err(e) => return self.unreadable(e),
         };
+        self.say_notes(std::mem::take(&mut listing.notes));
         let known: HashSet<&str> = listing.tiles.iter().map(|tile| &*tile.name).collect();
         let dropped =
             |(name, tile): &(&Arc<str>, &Tile)| tile.told.is_some() && !known.contains(&***name);
@@ -106,6 +107,14 @@ impl<F: Folders> ListWatch<F> {
         self.files.are_read();
         self.enter(listing, now);
         Ok(false)
+    }
+
+    /// Says what of the list does not count, once as long as it stays so.
+    fn say_notes(&mut self, notes: Vec<String>) {
+        for note in { notes.iter() }.filter(|note| !self.notes_said.contains(note)) {
+            log::warn!("{note}");
+        }
+        self.notes_said = notes;
     }
 
     fn raw(&self, listing: &Listing) -> Vec<RawTile> {

@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime};
 
 use glam::{DVec2, UVec2};
 use saccade_archive::acquisition::{
-    AcquisitionError, refuse_link_out, tile_configuration, trakem2,
+    AcquisitionError, refuse_link_out, tile_configuration, tile_list, trakem2,
 };
 use saccade_core::transform::SectionFromTile;
 
@@ -23,8 +23,8 @@ use crate::replay::lists::{self, Solution, is_project};
 pub(super) struct Named {
     /// Its name in the volume.
     pub(super) name: String,
-    /// The file's name without folder and extension: what solutions call it.
-    pub(super) stem: String,
+    /// What solutions call it.
+    pub(super) known_as: String,
     /// The image as the list names it.
     pub(super) file: String,
     /// Section as the list counts them.
@@ -39,6 +39,8 @@ pub(super) struct Listing {
     pub(super) tiles: Vec<Named>,
     /// What the list's own program found.
     pub(super) own: Option<Solution>,
+    /// What of it does not count, or otherwise than it is written, in words.
+    pub(super) notes: Vec<String>,
 }
 
 /// Reads a list, or a TrakEM2 project as one.
@@ -53,36 +55,35 @@ pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
     let is_xml = path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("xml"));
-    let (tiles, own): (Vec<_>, _) = if is_xml {
+    let (tiles, own, notes) = if is_xml {
         let patches = trakem2::read(path)?;
-        if let Some(left_out) = trakem2::left_out(&patches, path) {
-            log::warn!("{left_out}");
-        }
+        let note = trakem2::left_out(&patches, path);
         let tiles = patches.into_iter().map(|patch| {
-            let stem = patch.name().to_owned();
-            (stem, patch.file, patch.section, patch.transform)
+            let known_as = patch.name().to_owned();
+            (known_as, patch.file, patch.section, patch.transform)
         });
-        (tiles.collect(), None)
+        (tiles.collect(), None, Vec::from_iter(note))
     } else {
         let list = lists::read(path)?;
         let tiles = list.tiles.into_iter().map(|tile| {
-            let stem = tile.name().to_owned();
             let stage = SectionFromTile::translation(tile.corner);
-            (stem, tile.file, tile.section, stage)
+            (tile.known_as, tile.file, tile.section, stage)
         });
-        (tiles.collect(), list.solution)
+        (tiles.collect::<Vec<_>>(), list.solution, list.notes)
     };
     let mut taken = HashSet::new();
-    let named = tiles.into_iter().map(|(stem, file, section, stage)| Named {
-        name: unique(&stem, &file, &mut taken),
-        stem,
-        file,
-        section,
-        stage,
-    });
+    let named = tiles
+        .into_iter()
+        .map(|(known_as, file, section, stage)| Named {
+            name: unique(tile_list::stem(&file), &file, &mut taken),
+            known_as,
+            file,
+            section,
+            stage,
+        });
     let mut tiles: Vec<_> = named.collect();
     tiles.sort_by_key(|tile| tile.section);
-    Ok(Listing { tiles, own })
+    Ok(Listing { tiles, own, notes })
 }
 
 /// The line of a list, counted from 1, that has a tile in its section; for messages.
@@ -134,7 +135,7 @@ pub(super) struct Adopted {
 impl Adopted {
     /// Where it says that a tile lies, in the list's frame.
     pub(super) fn place(&self, tile: &Named) -> Option<SectionFromTile> {
-        let transform = self.solution.transforms.get(&tile.stem)?;
+        let transform = self.solution.transforms.get(&tile.known_as)?;
         Some(transform.shifted(-self.offset))
     }
 }
@@ -142,7 +143,8 @@ impl Adopted {
 /// Tiles as replay knows them.
 pub(super) fn raw(tiles: &[Named], size: impl Fn(usize) -> UVec2) -> Vec<RawTile> {
     let raw = tiles.iter().enumerate().map(|(n, tile)| RawTile {
-        name: tile.stem.clone(),
+        name: tile.name.clone(),
+        known_as: tile.known_as.clone(),
         image: PathBuf::new(),
         section: tile.section,
         size: size(n),
@@ -159,7 +161,7 @@ pub(super) fn adopt(
     projects: &[PathBuf],
     raw: Vec<RawTile>,
 ) -> Result<Option<Adopted>, AcquisitionError> {
-    let wanted: BTreeSet<&str> = listing.tiles.iter().map(|t| t.stem.as_str()).collect();
+    let wanted: BTreeSet<&str> = listing.tiles.iter().map(|t| t.known_as.as_str()).collect();
     // Names that mean several tiles cannot be looked up.
     if wanted.len() < listing.tiles.len() || wanted.is_empty() {
         return Ok(None);
@@ -185,17 +187,21 @@ pub(super) fn unused(listing: &Listing) -> Option<String> {
     let own = listing.own.as_ref()?;
     let mut known = HashSet::new();
     let path = own.path.display();
-    if let Some(twice) = listing.tiles.iter().find(|tile| !known.insert(&tile.stem)) {
+    if let Some(twice) = listing
+        .tiles
+        .iter()
+        .find(|tile| !known.insert(&tile.known_as))
+    {
         return Some(format!(
             "registration is not used: several tiles of the list are called {:?}, and it does not say which one it means; \
              give the images different names: {path}",
-            twice.stem
+            twice.known_as
         ));
     }
     let none = !listing
         .tiles
         .iter()
-        .any(|tile| own.transforms.contains_key(&tile.stem));
+        .any(|tile| own.transforms.contains_key(&tile.known_as));
     (none && !listing.tiles.is_empty())
         .then(|| format!("registration is not used: it names none of the list's images: {path}"))
 }
@@ -203,7 +209,7 @@ pub(super) fn unused(listing: &Listing) -> Option<String> {
 /// How far a solution's frame is from the list's \[pixels\]; `None` if it has none of the tiles.
 pub(super) fn offset(solution: &Solution, mut raw: Vec<RawTile>) -> Option<DVec2> {
     for tile in &mut raw {
-        tile.aligned = solution.transforms.get(&tile.name).copied();
+        tile.aligned = solution.transforms.get(&tile.known_as).copied();
     }
     median_offset(&raw)
 }
