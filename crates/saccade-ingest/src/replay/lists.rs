@@ -5,16 +5,20 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use glam::DVec2;
+use glam::{DVec2, UVec2};
 use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
 use saccade_archive::acquisition::tile_specs::{self, TileSpec};
 use saccade_archive::acquisition::trakem2::{self, Patch};
 use saccade_archive::acquisition::{
     AcquisitionError, readable, refuse_link_out, tile_configuration,
 };
-use saccade_core::transform::{SectionFromTile, TilePoint};
+use saccade_core::transform::SectionFromTile;
 
+mod stage;
 mod twice;
+
+pub(crate) use stage::Stage;
+use stage::transformed_corner;
 
 /// Where registration says that tiles lie.
 #[derive(Clone, Debug, PartialEq)]
@@ -58,8 +62,12 @@ pub(crate) struct Listed {
     pub(crate) known_as: String,
     /// Low corner in its section \[pixels\].
     pub(crate) corner: DVec2,
+    /// The same as the stage has it, whatever that counts in.
+    pub(crate) laid_out: Option<DVec2>,
     /// Section: z index, possibly not starting at 0.
     pub(crate) section: u32,
+    /// Width and height \[pixels\], if the list says so.
+    pub(crate) size: Option<UVec2>,
 }
 
 impl Listed {
@@ -75,7 +83,9 @@ impl From<ListedTile> for Listed {
             known_as: tile.name().to_owned(),
             file: tile.file,
             corner: tile.corner,
+            laid_out: None,
             section: tile.section,
+            size: None,
         }
     }
 }
@@ -84,6 +94,8 @@ impl From<ListedTile> for Listed {
 pub(crate) struct List {
     pub(crate) tiles: Vec<Listed>,
     pub(crate) solution: Option<Solution>,
+    /// What its stage counts, where that is not certain.
+    pub(crate) stage: Option<Stage>,
     /// What of it does not count, or otherwise than it is written, in words.
     pub(crate) notes: Vec<String>,
 }
@@ -94,6 +106,7 @@ impl List {
         Self {
             tiles: tiles.into_iter().map(Listed::from).collect(),
             solution,
+            stage: None,
             notes: note.into_iter().collect(),
         }
     }
@@ -221,30 +234,6 @@ pub(crate) fn is_project(path: &Path) -> bool {
     readable(&text).contains("t2_patch")
 }
 
-/// Where the transform of a tile puts its corner.
-fn transformed_corner(spec: &TileSpec) -> DVec2 {
-    spec.transform.apply(TilePoint(DVec2::ZERO)).0
-}
-
-/// Whether the stage's places are like the transforms', but for where both begin: within a tile's size for three tiles of four. Some
-/// microscopes write nanometers, or steps of a motor, which would make of a section one that is many times as large.
-fn stage_counts_pixels(specs: &[TileSpec]) -> bool {
-    let apart = |spec: &TileSpec| Some(transformed_corner(spec) - spec.stage?);
-    let apart: Vec<DVec2> = specs.iter().filter_map(apart).collect();
-    let middle = |axis: usize| {
-        let mut all: Vec<f64> = apart.iter().map(|apart| apart[axis]).collect();
-        let middle = all.len() / 2;
-        match middle < all.len() {
-            true => *all.select_nth_unstable_by(middle, f64::total_cmp).1,
-            false => 0.0,
-        }
-    };
-    let middle = DVec2::new(middle(0), middle(1));
-    let tile = { specs.iter() }.fold(0, |most, spec| most.max(spec.size.max_element()));
-    let near = |apart: &&DVec2| (**apart - middle).abs().max_element() <= f64::from(tile);
-    4 * apart.iter().filter(near).count() >= 3 * apart.len()
-}
-
 fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
     let transforms = tiles.iter().map(|tile| {
         let transform = SectionFromTile::translation(tile.corner);
@@ -270,12 +259,12 @@ fn known_as(specs: &[TileSpec]) -> Vec<String> {
     specs.iter().map(known_as).collect()
 }
 
-/// Of tiles that know no stage, or one that does not count pixels, the transform says roughly where it was.
+/// Of tiles that know no stage, or one that does not count pixels as far as can be told, the transform says roughly where it was.
 fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
     let (specs, note) = twice::specs_once(specs, path);
     let mut notes = Vec::from_iter(note);
-    let counts = stage_counts_pixels(&specs);
-    if !counts {
+    let stage = Stage::of(&specs);
+    if stage == Stage::Other {
         notes.push(format!(
             "the stage's places (layout) are not in pixels, or other than the transforms', and are passed over: {}",
             path.display()
@@ -285,8 +274,11 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
     let tiles = specs.iter().zip(&known_as).map(|(spec, known_as)| Listed {
         file: spec.file.clone(),
         known_as: known_as.clone(),
-        corner: { spec.stage.filter(|_| counts) }.unwrap_or_else(|| transformed_corner(spec)),
+        corner: { spec.stage.filter(|_| stage == Stage::Pixels) }
+            .unwrap_or_else(|| transformed_corner(spec)),
+        laid_out: spec.stage,
         section: spec.section,
+        size: Some(spec.size),
     });
     let tiles = tiles.collect();
     let mut left_out: Vec<&str> = specs
@@ -311,6 +303,7 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
                 .map(|(name, spec)| (name, spec.transform))
                 .collect(),
         }),
+        stage: Some(stage),
         notes,
     }
 }

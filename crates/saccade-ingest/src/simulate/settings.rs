@@ -48,6 +48,12 @@ impl Settings {
         Self::new(json!({ "list": list, "origin": origin, "first": first, "pixel": pixel }))
     }
 
+    /// The same with one more that is text.
+    pub(crate) fn with(mut self, name: &str, text: &str) -> Self {
+        self.0.insert(name.to_owned(), text.into());
+        self
+    }
+
     /// Of what registration found, and how far its frame is from the stage's.
     pub(crate) fn of_solution(path: &str, offset: [f64; 2]) -> Self {
         Self::new(json!({ "solution": path, "offset": offset }))

@@ -43,6 +43,7 @@ use index::{Index, Sought, base, key};
 use source::{Adopted, Files};
 
 mod config;
+mod counted;
 mod follow;
 mod frame;
 mod index;

@@ -4,6 +4,7 @@ mod power_cuts;
 mod refused;
 mod registration;
 mod replayed;
+mod stage;
 mod twice;
 
 use std::collections::BTreeMap;

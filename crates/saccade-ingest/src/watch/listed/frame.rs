@@ -13,6 +13,7 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, MAX_EXTENT};
 
 use super::super::{LINK, SETTINGS, WatchError, is_unused};
+use super::counted::Counted;
 use super::index::{Index, Sought};
 use super::source::{Adopted, Listing, adopt, line_of, raw};
 use super::{ListConfig, ListError};
@@ -23,6 +24,9 @@ use crate::simulate::settings::{Settings, difference, volume_differences};
 
 /// Name of the file that says which solution is used.
 const SOLUTION: &str = "solution.json";
+
+/// Name of the setting that says in which pixels the list counts.
+const COUNTED: &str = "counted";
 
 /// The volume, and where in the list it lies.
 #[derive(Clone, Debug)]
@@ -35,6 +39,8 @@ pub(super) struct Frame {
     pub(super) first: u32,
     /// Size of a pixel \[voxels\].
     scale: f64,
+    /// In which pixels, where that is not certain.
+    pub(super) counted: Option<Counted>,
 }
 
 /// A path as it is kept: below the folder, with which it moves, or elsewhere.
@@ -100,6 +106,7 @@ impl Frame {
                 origin: config.origin.or(origin).unwrap_or_default(),
                 first: config.first.or(there.number("first")).unwrap_or(0),
                 scale: config.scale,
+                counted: there.text(COUNTED).and_then(Counted::parse),
             }
         });
         if let Some((frame, there)) = frame.as_ref().zip(settings.as_ref()) {
@@ -119,13 +126,28 @@ impl Frame {
 
     fn settings(&self, folder: &Path) -> Settings {
         let list = shown(&self.list, folder);
-        Settings::of_list(&list, self.origin.to_array(), self.first, self.scale)
+        let settings = Settings::of_list(&list, self.origin.to_array(), self.first, self.scale);
+        match self.counted {
+            Some(counted) => settings.with(COUNTED, counted.text()),
+            None => settings,
+        }
     }
 
     pub(super) fn keep(&self, folder: &Path, kept: &Path) -> Result<(), WatchError> {
         self.info.write(kept)?;
         self.settings(folder).write_to(kept.join(SETTINGS))?;
         Ok(())
+    }
+
+    /// In which pixels the list counts. Earlier versions, which kept nothing of it, took a stage of which nothing can be
+    /// told for one that counts.
+    pub(super) fn counted(&self) -> Counted {
+        self.counted.unwrap_or(Counted::Stage)
+    }
+
+    /// Says that the volume's corner lies elsewhere in the list, by so much \[voxels\].
+    pub(super) fn shift(&mut self, by: DVec2) {
+        self.origin += by / self.scale;
     }
 
     /// Whether a tile would lie in the volume.
@@ -177,8 +199,8 @@ pub(super) fn keep_adopted(
     Ok(())
 }
 
-/// Settles the frame, from what is listed and from the images that are there. Those that are missing count as large
-/// as the largest of the others.
+/// Settles the frame, from what is listed and from the images that are there. Those that are missing are as large as
+/// the list says, or count as large as the largest of the others.
 pub(super) fn begin(
     config: &ListConfig,
     folder: &Path,
@@ -209,7 +231,10 @@ pub(super) fn begin(
             list: config.list.clone(),
         });
     }
-    let mut raw = raw(tiles, |n| sizes[n].or(largest).unwrap_or(UVec2::ONE));
+    let mut raw = raw(tiles, |n| {
+        let size = sizes[n].or(tiles[n].size).or(largest);
+        size.unwrap_or(UVec2::ONE)
+    });
     let adopted = adopt(listing, projects, raw.clone());
     let adopted = adopted.map_err(|e| ListError::List { source: e.into() })?;
     if let Some(adopted) = &adopted {
@@ -259,6 +284,7 @@ pub(super) fn begin(
         origin: origin.unwrap_or_default(),
         first,
         scale: config.scale,
+        counted: listing.counts.map(Counted::of),
     };
     Ok((frame, adopted))
 }

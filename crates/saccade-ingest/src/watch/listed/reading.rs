@@ -70,6 +70,7 @@ impl<F: Folders> ListWatch<F> {
                 return Ok(true);
             }
         }
+        let counted = self.count(&mut listing);
         if self.frame.is_none() {
             let begun = frame::begin(
                 &self.config,
@@ -86,7 +87,9 @@ impl<F: Folders> ListWatch<F> {
             match solution_again(&adopted.solution.path, listing.own.as_ref()) {
                 Ok(solution) => {
                     adopted.solution = solution;
-                    self.align(&listing)?;
+                    if !counted.is_some_and(|now| self.counts_otherwise(now)) {
+                        self.align(&listing)?;
+                    }
                 }
                 Err(e) => return self.unreadable(e),
             }
@@ -101,6 +104,9 @@ impl<F: Folders> ListWatch<F> {
                 }
                 Err(e) => return self.unreadable(e),
             }
+        }
+        if let Some(counted) = counted {
+            self.keep_counted(&listing, counted)?;
         }
         self.say_shift();
         self.say_unsolved(&listing);
@@ -117,11 +123,15 @@ impl<F: Folders> ListWatch<F> {
         self.notes_said = notes;
     }
 
-    fn raw(&self, listing: &Listing) -> Vec<RawTile> {
+    /// The tiles as replay knows them; those that are not there count as large as the largest of the others.
+    pub(super) fn raw(&self, listing: &Listing) -> Vec<RawTile> {
+        let size = |name: &str| Some(self.tiles.get(name)?.told.as_ref()?.size);
+        let sizes = listing.tiles.iter().filter_map(|tile| size(&tile.name));
+        let largest = sizes.max_by_key(|size| u64::from(size.x) * u64::from(size.y));
         raw(&listing.tiles, |n: usize| {
-            let told = self.tiles.get(&*listing.tiles[n].name);
-            told.and_then(|t| t.told.as_ref())
-                .map_or(UVec2::ONE, |told| told.size)
+            let tile = &listing.tiles[n];
+            let size = size(&tile.name).or(tile.size).or(largest);
+            size.unwrap_or(UVec2::ONE)
         })
     }
 

@@ -10,13 +10,13 @@ use glam::{DVec2, UVec2};
 use saccade_archive::acquisition::{
     AcquisitionError, refuse_link_out, tile_configuration, tile_list, trakem2,
 };
-use saccade_core::transform::SectionFromTile;
+use saccade_core::transform::{SectionFromTile, TilePoint};
 
 use super::super::{Folders, Stamp};
 use crate::replay::RawTile;
 use crate::replay::acquisition::median_offset;
 use crate::replay::detect::{LARGEST_LIST, best};
-use crate::replay::lists::{self, Solution, is_project};
+use crate::replay::lists::{self, Solution, Stage, is_project};
 
 /// A tile that a list names.
 #[derive(Clone, Debug)]
@@ -29,8 +29,12 @@ pub(super) struct Named {
     pub(super) file: String,
     /// Section as the list counts them.
     pub(super) section: u32,
+    /// Width and height \[pixels\], if the list says so.
+    pub(super) size: Option<UVec2>,
     /// Where the list says that it lies \[pixels\].
     pub(super) stage: SectionFromTile,
+    /// Its corner as the stage has it, whatever that counts in.
+    pub(super) laid_out: Option<DVec2>,
 }
 
 /// What the files say.
@@ -39,8 +43,22 @@ pub(super) struct Listing {
     pub(super) tiles: Vec<Named>,
     /// What the list's own program found.
     pub(super) own: Option<Solution>,
+    /// What its stage counts, where that is not certain.
+    pub(super) counts: Option<Stage>,
     /// What of it does not count, or otherwise than it is written, in words.
     pub(super) notes: Vec<String>,
+}
+
+impl Listing {
+    /// Says of all tiles that they lie where the stage has them, or where the transforms do.
+    pub(super) fn count_as(&mut self, stage: bool) {
+        for tile in &mut self.tiles {
+            let own = { self.own.as_ref() }.and_then(|own| own.transforms.get(&tile.known_as));
+            let there = own.map(|own| own.apply(TilePoint(DVec2::ZERO)).0);
+            let corner = tile.laid_out.filter(|_| stage).or(there);
+            tile.stage = corner.map_or(tile.stage, SectionFromTile::translation);
+        }
+    }
 }
 
 /// Reads a list, or a TrakEM2 project as one.
@@ -55,35 +73,46 @@ pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
     let is_xml = path
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("xml"));
-    let (tiles, own, notes) = if is_xml {
+    let mut taken = HashSet::new();
+    let mut unique = |file: &str| unique(tile_list::stem(file), file, &mut taken);
+    let mut listing = if is_xml {
         let patches = trakem2::read(path)?;
         let note = trakem2::left_out(&patches, path);
-        let tiles = patches.into_iter().map(|patch| {
-            let known_as = patch.name().to_owned();
-            (known_as, patch.file, patch.section, patch.transform)
+        let named = patches.into_iter().map(|patch| Named {
+            name: unique(&patch.file),
+            known_as: patch.name().to_owned(),
+            section: patch.section,
+            size: Some(patch.size),
+            stage: patch.transform,
+            laid_out: None,
+            file: patch.file,
         });
-        (tiles.collect(), None, Vec::from_iter(note))
+        Listing {
+            tiles: named.collect(),
+            own: None,
+            counts: None,
+            notes: Vec::from_iter(note),
+        }
     } else {
         let list = lists::read(path)?;
-        let tiles = list.tiles.into_iter().map(|tile| {
-            let stage = SectionFromTile::translation(tile.corner);
-            (tile.known_as, tile.file, tile.section, stage)
+        let named = list.tiles.into_iter().map(|tile| Named {
+            name: unique(&tile.file),
+            known_as: tile.known_as,
+            section: tile.section,
+            size: tile.size,
+            stage: SectionFromTile::translation(tile.corner),
+            laid_out: tile.laid_out,
+            file: tile.file,
         });
-        (tiles.collect::<Vec<_>>(), list.solution, list.notes)
+        Listing {
+            tiles: named.collect(),
+            own: list.solution,
+            counts: list.stage,
+            notes: list.notes,
+        }
     };
-    let mut taken = HashSet::new();
-    let named = tiles
-        .into_iter()
-        .map(|(known_as, file, section, stage)| Named {
-            name: unique(tile_list::stem(&file), &file, &mut taken),
-            known_as,
-            file,
-            section,
-            stage,
-        });
-    let mut tiles: Vec<_> = named.collect();
-    tiles.sort_by_key(|tile| tile.section);
-    Ok(Listing { tiles, own, notes })
+    listing.tiles.sort_by_key(|tile| tile.section);
+    Ok(listing)
 }
 
 /// The line of a list, counted from 1, that has a tile in its section; for messages.
