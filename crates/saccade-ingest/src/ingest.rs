@@ -20,6 +20,7 @@
 
 mod absent;
 mod away;
+mod earlier;
 mod enter;
 mod error;
 mod images;

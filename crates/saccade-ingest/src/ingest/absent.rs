@@ -20,6 +20,8 @@ pub(super) struct Absent {
     records: BTreeMap<u64, Waiting>,
     /// The last one that was looked for.
     last: Option<u64>,
+    /// Whether one has come that was not looked for.
+    is_new: bool,
 }
 
 impl Absent {
@@ -27,7 +29,13 @@ impl Absent {
     pub(super) fn add(&mut self, waiting: Waiting) {
         if self.records.len() < MOST {
             self.records.insert(waiting.position, waiting);
+            self.is_new = true;
         }
+    }
+
+    /// Whether each was looked for.
+    pub(super) fn are_all_looked_for(&self) -> bool {
+        self.last.is_none() && !self.is_new
     }
 
     /// Those whose image has come, of the next few, taken out.
@@ -36,6 +44,7 @@ impl Absent {
         let next = { self.records.range((from, Unbounded)) }.take(AT_ONCE);
         let next: Vec<u64> = next.map(|(position, _)| *position).collect();
         // Once all were looked for, it begins anew.
+        self.is_new &= self.last.is_some();
         self.last = next.last().copied().filter(|_| next.len() == AT_ONCE);
         let is_there = |waiting: &Waiting| {
             let path = images.path(&waiting.record.file);

@@ -17,6 +17,7 @@ use saccade_archive::storage::StorageError;
 use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 
+use super::earlier::Earlier;
 use super::enter::{COMMIT_AT_ONCE, Enter, SetAside, retry};
 use super::images::Images;
 use super::prepare::{Context, Stored};
@@ -108,6 +109,10 @@ pub async fn run(
     if let Some(why) = why {
         progress.notice(why);
     }
+    let images = Images::new(acquisition, options.linked.as_deref());
+    let set_aside = || catalog.quarantined(&volume.name);
+    let set_aside = retry(clock, options, progress, set_aside).await?;
+    let earlier = Earlier::new(acquisition, cursor, &set_aside);
     let (name, process) = (worker_name(), process::this().unwrap_or_default());
     let register = || catalog.register_process(&name, &process, options.lease);
     let worker = retry(clock, options, progress, register).await?;
@@ -115,7 +120,7 @@ pub async fn run(
         archive,
         options,
         context: Context {
-            images: Images::new(acquisition, options.linked.as_deref()),
+            images,
             volume: &volume.name,
             extent: volume.extent(),
             channels: &volume.channels,
@@ -129,6 +134,7 @@ pub async fn run(
         worker: &worker,
         reader,
         room: WaitingRoom::new(options.patience, options.poll, Vec::new()),
+        earlier,
         meter: Meter::new(clock.monotonic()),
         summary: Summary::default(),
         left: AtomicU64::new(0),
@@ -224,6 +230,7 @@ struct Ingest<'a> {
     worker: &'a Worker,
     reader: RecordReader,
     room: WaitingRoom,
+    earlier: Option<Earlier>,
     meter: Meter,
     summary: Summary,
     /// Records still to do, as far as this worker knows.
@@ -242,7 +249,22 @@ impl Ingest<'_> {
             for notice in self.room.news(images) {
                 self.context.progress.notice(&notice);
             }
+            if let Some(earlier) = &mut self.earlier {
+                loop {
+                    for waiting in earlier.read(images) {
+                        self.room.look_for(waiting);
+                    }
+                    // Who waits for the end is not kept waiting for longer than it takes.
+                    if !self.options.once || earlier.is_read() {
+                        break;
+                    }
+                }
+                if earlier.is_read() {
+                    self.earlier = None;
+                }
+            }
             let came = self.room.came(images);
+            let looks_on = !came.is_empty() || !self.room.has_looked_for_all();
             self.take_up(came).await?;
             let due: VecDeque<_> = due.into_iter().map(Job::from).collect();
             let worked = self.work(due).await?;
@@ -261,7 +283,7 @@ impl Ingest<'_> {
                 self.context.retry(bury).await?;
             }
             // Others may still be at work; should they die, it is this one's turn.
-            if worked == 0 && self.options.once && queued + waiting == 0 {
+            if worked == 0 && self.options.once && queued + waiting == 0 && !looks_on {
                 return Ok(());
             }
             if worked < self.options.batch {

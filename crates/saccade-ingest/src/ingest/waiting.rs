@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use saccade_archive::catalog::Waiting;
+use saccade_archive::catalog::{Quarantined, Waiting};
 
 use super::absent::Absent;
 use super::images::Images;
@@ -11,6 +11,18 @@ use super::prepare::{Look, Outcome, WaitKind, look, quarantine};
 
 /// Longest pause between two looks at a file \[polls\].
 const LONGEST_PAUSE: u64 = 16;
+
+/// What is said of a record that was given up since there was no file.
+const NOT_COME: &str = "It did not come within";
+
+/// The same of one whose file was there before.
+const NOT_COME_BACK: &str = "The file did not come back within";
+
+/// Whether a record was given up since there was no file.
+pub(super) fn is_absent(set_aside: &Quarantined) -> bool {
+    let reason = &set_aside.reason;
+    set_aside.bytes.is_none() && (reason.contains(NOT_COME) || reason.contains(NOT_COME_BACK))
+}
 
 /// The records that wait, and what their files looked like.
 #[derive(Debug)]
@@ -128,6 +140,16 @@ impl WaitingRoom {
         self.absent.came(images)
     }
 
+    /// Looks for the image of a record that an earlier process gave up.
+    pub(super) fn look_for(&mut self, waiting: Waiting) {
+        self.absent.add(waiting);
+    }
+
+    /// Whether each of those was looked for.
+    pub(super) fn has_looked_for_all(&self) -> bool {
+        self.absent.are_all_looked_for()
+    }
+
     /// A record is done with, whatever became of it.
     pub(super) fn leave(&mut self, position: u64) {
         self.records.remove(&position);
@@ -170,14 +192,15 @@ impl WaitingRoom {
             let seconds = self.interval.saturating_mul(polls).as_secs_f64();
             let again = images.again();
             let reason = match guest.kind {
-                WaitKind::Incomplete if now.is_none() && images.are_watched() => format!(
-                    "{reason}. The file did not come back within {seconds:.1} s; once it is whole, {again}"
-                ),
                 WaitKind::Incomplete if now.is_none() => {
                     self.absent.add(guest.waiting.clone());
+                    let not_come = match images.are_watched() {
+                        true => NOT_COME_BACK,
+                        false => NOT_COME,
+                    };
                     format!(
-                        "{reason}. It did not come within {seconds:.1} s; should it come while `saccade ingest` goes on, it \
-                         is taken in, else {again} once it is there"
+                        "{reason}. {not_come} {seconds:.1} s; once it is there, `saccade ingest` takes it in, also when it is \
+                         started again: you need not {again}"
                     )
                 }
                 WaitKind::Incomplete => format!(

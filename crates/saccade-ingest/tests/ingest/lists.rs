@@ -367,6 +367,35 @@ async fn a_list_that_is_mended_leaves_nothing_set_aside() {
     assert_eq!(set_aside().await, []);
 }
 
+/// A disk that is taken away and put back shows the same files.
+#[tokio::test]
+async fn an_image_that_was_away_while_it_was_to_be_read_is_taken_in_once_it_is_back() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let mut want = Want::default();
+    for (seed, name) in (1..).zip(["a", "b"]) {
+        scope.image(name, seed);
+        want.0
+            .insert(name.to_owned(), (0, [f64::from(seed), 0.0], seed));
+    }
+    write(&list, want.list());
+    let mut watch = scope.watch(roomy(&list));
+    follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+    drop(watch);
+    let (image, away) = (scope.file("pictures/b.tif"), scope.0.path().join("b.tif"));
+    fs::rename(&image, &away).unwrap();
+    scope.once(roomy(&list), &archive).await;
+    let set_aside = async || archive.catalog().quarantined(VOLUME).await.unwrap().len();
+    assert_eq!((seen(&archive).await.len(), set_aside().await), (1, 1));
+    let told = scope.records().len();
+    fs::rename(&away, &image).unwrap();
+    scope.once(roomy(&list), &archive).await;
+    assert_eq!(scope.records().len(), told, "it is the same file");
+    assert!(want.is_shown(&archive).await);
+    assert_eq!(set_aside().await, 0);
+}
+
 /// Follows a list and is killed, again and again, while the list changes: in the end all is as the list has it, and
 /// what did not change was not told of again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -292,6 +292,48 @@ async fn a_file_that_comes_late_is_taken_in() {
     );
 }
 
+/// Also where it comes while nobody looks, whoever looks then.
+#[tokio::test]
+async fn a_file_that_comes_between_two_runs_is_taken_in_by_the_next() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    for late in ["first", "second", "never"] {
+        scope.say(&tile_record(late, 0, SIZE));
+    }
+    scope.tile("there", 0, SIZE, 3);
+    let again = async |once: bool, tiles: u64| {
+        let options = saccade_ingest::ingest::IngestOptions { once, ..quick() };
+        let cancel = Cancel::new();
+        let ingest = run(scope.path(), &archive, &options, &(), &cancel);
+        let ends = async {
+            while !once && archive.catalog().entry(VOLUME).await.unwrap().tiles < tiles {
+                tokio::time::sleep(options.poll).await;
+            }
+            if !once {
+                cancel.cancel();
+            }
+        };
+        let both = async { tokio::join!(ingest, ends) };
+        let both = tokio::time::timeout(std::time::Duration::from_secs(60), both).await;
+        both.expect("it is taken in").0.unwrap();
+        let set_aside = archive.catalog().quarantined(VOLUME).await.unwrap();
+        (
+            archive.catalog().entry(VOLUME).await.unwrap().tiles,
+            set_aside.len(),
+        )
+    };
+    assert_eq!(again(true, 1).await, (1, 3));
+    scope.image("first", SIZE, 1);
+    assert_eq!(again(true, 2).await, (2, 2));
+    scope.image("second", SIZE, 2);
+    assert_eq!(again(false, 3).await, (3, 1));
+    assert_eq!(again(true, 3).await, (3, 1));
+    let seen = seen(&archive).await;
+    for (name, seed) in [("first", 1), ("second", 2), ("there", 3)] {
+        assert_eq!(pixels(&seen[name]).await, texture(SIZE, seed), "{name}");
+    }
+}
+
 #[tokio::test]
 async fn a_kind_of_image_that_is_not_known() {
     let what = refused(|scope| {
