@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use saccade_archive::acquisition::{
-    AcquisitionError, AcquisitionInfo, Record, TileRecord, TransformRecord,
+    AcquisitionError, AcquisitionInfo, ChannelRef, Record, TileRecord, TransformRecord,
 };
 use saccade_archive::image::ImageError;
 use saccade_core::volume::check_name;
@@ -203,7 +203,7 @@ pub fn run(
             section: tile.section,
             size: tile.size,
             transform: tile.stage,
-            channel: None,
+            channel: tile.channel.clone().map(ChannelRef::Name),
         }))?;
         summary.tiles += 1;
         summary.pixels += pixels;
@@ -263,6 +263,7 @@ fn described(
     crate::simulate::check_rate_and_voxel(config.rate_mpixel_s, config.voxel_nm)?;
     let mut info = AcquisitionInfo::new(name, acquisition.extent, config.voxel_nm);
     info.dtype = acquisition.dtype;
+    info.channels.clone_from(&acquisition.channels);
     Ok((info, Settings::of_replay(&acquisition.identity())))
 }
 

@@ -10,7 +10,7 @@ use saccade_core::transform::SectionFromTile;
 use serde::Deserialize;
 
 use super::AcquisitionError;
-use super::text::content;
+use super::text::{content, quoted};
 use super::tile_list::stem;
 
 /// A tile of a Render stack.
@@ -18,8 +18,10 @@ use super::tile_list::stem;
 pub struct TileSpec {
     /// Its id.
     pub id: String,
-    /// Its full-size image: a path, without the scheme of a file URL.
+    /// Its full-size image: a path, without the scheme of a file URL; of several channels, the one that is shown by default.
     pub file: String,
+    /// Its images of several channels, if it has such.
+    pub channels: Vec<ChannelImage>,
     /// Section: its z, possibly not starting at 0.
     pub section: u32,
     /// Width and height \[pixels\].
@@ -30,6 +32,22 @@ pub struct TileSpec {
     pub transform: SectionFromTile,
     /// Kinds of transform that are left out: deformations of the lens, which come before the affine ones.
     pub left_out: Vec<String>,
+}
+
+/// The image of one channel of a tile.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ChannelImage {
+    /// The channel's name.
+    pub name: String,
+    /// The full-size image, as [`TileSpec::file`].
+    pub file: String,
+}
+
+impl ChannelImage {
+    /// The image's name without folder and extension.
+    pub fn stem(&self) -> &str {
+        stem(&self.file)
+    }
 }
 
 impl TileSpec {
@@ -47,8 +65,19 @@ struct Json {
     width: f64,
     height: f64,
     layout: Option<Layout>,
+    #[serde(default)]
     mipmap_levels: BTreeMap<String, Mipmap>,
+    #[serde(default)]
+    channels: Option<Vec<Channel>>,
     transforms: Transforms,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Channel {
+    name: Option<String>,
+    #[serde(default)]
+    mipmap_levels: BTreeMap<String, Mipmap>,
 }
 
 #[derive(Deserialize)]
@@ -130,9 +159,19 @@ fn spec(json: Json) -> Result<TileSpec, String> {
             ))
         }
     };
-    let full_size = json.mipmap_levels.get("0");
-    let url = full_size.and_then(|level| level.image_url.as_deref());
-    let url = url.ok_or("it has no image of level 0")?;
+    let channels = json.channels.as_deref().unwrap_or_default();
+    // One without a name is what others have at the top.
+    let alone = match channels {
+        [one] if one.name.is_none() => full_size(&one.mipmap_levels),
+        _ => None,
+    };
+    let channels = match alone {
+        Some(_) => Vec::new(),
+        None => channel_images(channels)?,
+    };
+    let file = full_size(&json.mipmap_levels).or(alone);
+    let file = file.or_else(|| channels.first().map(|channel| channel.file.clone()));
+    let file = file.ok_or("it has no image of level 0")?;
     let mut affine = DAffine2::IDENTITY;
     let mut left_out = Vec::new();
     for transform in &json.transforms.spec_list {
@@ -147,10 +186,8 @@ fn spec(json: Json) -> Result<TileSpec, String> {
         stage.is_finite().then_some(stage)
     });
     Ok(TileSpec {
-        file: url
-            .strip_prefix("file:")
-            .map_or(url, without_host)
-            .to_owned(),
+        file,
+        channels,
         section: whole("z", json.z, 0.0)?,
         size: UVec2::new(
             whole("width", json.width, 1.0)?,
@@ -161,6 +198,35 @@ fn spec(json: Json) -> Result<TileSpec, String> {
         transform,
         left_out,
     })
+}
+
+/// The image of level 0.
+fn full_size(levels: &BTreeMap<String, Mipmap>) -> Option<String> {
+    let url = levels.get("0")?.image_url.as_deref()?;
+    let path = url.strip_prefix("file:").map_or(url, without_host);
+    Some(path.to_owned())
+}
+
+fn channel_images(channels: &[Channel]) -> Result<Vec<ChannelImage>, String> {
+    let mut images: Vec<ChannelImage> = Vec::with_capacity(channels.len());
+    for channel in channels {
+        let name = channel
+            .name
+            .as_deref()
+            .filter(|name| !name.trim().is_empty());
+        let name = name.ok_or("one of its channels has no name")?;
+        if images.iter().any(|image| image.name == name) {
+            return Err(format!("two of its channels are called {}", quoted(name)));
+        }
+        let file = full_size(&channel.mipmap_levels);
+        let file =
+            file.ok_or_else(|| format!("its channel {} has no image of level 0", quoted(name)))?;
+        images.push(ChannelImage {
+            name: name.to_owned(),
+            file,
+        });
+    }
+    Ok(images)
 }
 
 /// `///path`, `//path` and `/path` are all written for the same file.
@@ -253,6 +319,36 @@ mod tests {
         let at = other[0].transform.apply(TilePoint(DVec2::new(2.0, 3.0)));
         assert_eq!(at.0, DVec2::new(2.0, 108.0));
         assert_eq!(other[0].stage, None);
+    }
+
+    #[test]
+    fn channels_have_images_of_their_own() {
+        let channel = |name: &str, file: &str| {
+            format!(r#"{{{name} "mipmapLevels": {{"0": {{"imageUrl": "file:/raw/{file}.tif"}}}}}}"#)
+        };
+        let read =
+            |channels: &[String]| parse("", &format!(r#", "channels": [{}]"#, channels.join(",")));
+        let named = |name: &str| channel(&format!(r#""name": "{name}","#), name);
+        let tile = &read(&[named("PSD95"), named("DAPI")]).unwrap()[0];
+        let images: Vec<_> = { tile.channels.iter() }
+            .map(|c| (&*c.name, &*c.file))
+            .collect();
+        assert_eq!(
+            images,
+            [("PSD95", "/raw/PSD95.tif"), ("DAPI", "/raw/DAPI.tif")]
+        );
+        assert_eq!(tile.file, "/scope/a.b/c.tif");
+        let none = channel("", "only");
+        assert_eq!(read(&[]).unwrap()[0].channels, []);
+        assert_eq!(read(&[none.clone()]).unwrap()[0].channels, []);
+        for (bad, why) in [
+            (vec![named("a"), none], "no name"),
+            (vec![named("a"), named("a")], "are called \"a\""),
+            (vec![r#"{"name": "a"}"#.to_owned()], "no image of level 0"),
+        ] {
+            let refused = read(&bad).unwrap_err().to_string();
+            assert!(refused.contains(why), "{refused}");
+        }
     }
 
     #[test]

@@ -34,6 +34,8 @@ pub struct RawTile {
     pub stage: SectionFromTile,
     /// Where the solution says it lies.
     pub aligned: Option<SectionFromTile>,
+    /// The channel that it shows, if the list says so.
+    pub channel: Option<String>,
 }
 
 /// Tiles with stage positions, and a solution if there is one.
@@ -51,6 +53,8 @@ pub struct Acquisition {
     pub dtype: Dtype,
     /// How many images have 8 bits or fewer, where others have 16: those are spread over all 16.
     pub shallow: usize,
+    /// Names of the channels that the list names, in the order in which it does.
+    pub channels: Vec<String>,
     /// In the order of acquisition: by section, then as listed.
     pub tiles: Vec<RawTile>,
 }
@@ -73,8 +77,14 @@ impl Acquisition {
         listed.say_notes();
         let images = Images::below(folder)?;
         let named = solution.map(Solution::read).transpose()?;
-        let solution = named.or(listed.solution);
-        Self::new(folder, &images, list, &listed.tiles, solution.as_ref())
+        let solution = named.or_else(|| listed.solution.clone());
+        Self::new(
+            folder,
+            &images,
+            list,
+            listed.of_all_channels(),
+            solution.as_ref(),
+        )
     }
 
     pub(super) fn new(
@@ -120,6 +130,7 @@ impl Acquisition {
                 section: tile.section - first_section,
                 stage: SectionFromTile::translation(tile.corner),
                 aligned: solution.and_then(|s| s.transforms.get(&tile.known_as).copied()),
+                channel: tile.channel.clone(),
             });
         }
         tiles.sort_by_key(|tile| tile.section);
@@ -136,6 +147,7 @@ impl Acquisition {
                 Dtype::Uint8
             },
             shallow: if deep > 0 { shallow } else { 0 },
+            channels: lists::channel_names(listed.iter().map(|tile| tile.channel.as_deref())),
             tiles,
         })
     }
@@ -150,6 +162,10 @@ impl Acquisition {
             // A zero byte ends the name, so that no two lists of tiles make the same bytes.
             fingerprint.add(tile.name.as_bytes());
             fingerprint.add(&[0, u8::from(tile.aligned.is_some())]);
+            if let Some(channel) = &tile.channel {
+                fingerprint.add(channel.as_bytes());
+                fingerprint.add(&[0]);
+            }
             for number in [tile.section, tile.size.x, tile.size.y] {
                 fingerprint.add(&number.to_le_bytes());
             }

@@ -220,7 +220,7 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
         }
         // Says which images are missing.
         Some((list, listed, false)) => {
-            Acquisition::new(folder, &images, &list, &listed.tiles, None).map(Some)
+            Acquisition::new(folder, &images, &list, listed.of_all_channels(), None).map(Some)
         }
         None => refuse_project_alone(tree, &images).map(|()| None),
     }
@@ -254,7 +254,7 @@ fn chosen(tree: &Tree, images: &Images) -> Result<Option<(PathBuf, List, bool)>,
             // Most files are no lists; that is no error.
             Err(_) => continue,
         };
-        let tiles = &listed.tiles;
+        let tiles = listed.of_all_channels();
         let here = tiles
             .iter()
             .filter(|tile| images.find(&tile.file).is_some());
@@ -283,7 +283,7 @@ fn another<'a>(tree: &'a Tree, images: &Images, list: &Path) -> Option<&'a Path>
     let others = others.filter(|path| tree.refuse_link_out(path).is_ok());
     others.take(MOST).find(|path| {
         lists::read(path).is_ok_and(|listed| {
-            let mut tiles = listed.tiles.iter();
+            let mut tiles = listed.of_all_channels().iter();
             tiles.any(|tile| images.find(&tile.file).is_some())
         })
     })
@@ -328,9 +328,10 @@ fn with_solution(
     list: &Path,
     listed: List,
 ) -> Result<Acquisition, ReplayError> {
-    let wanted: BTreeSet<&str> = listed.tiles.iter().map(|tile| &*tile.known_as).collect();
-    let unsolved = Acquisition::new(folder, images, list, &listed.tiles, None)?;
-    if wanted.len() < listed.tiles.len() {
+    let tiles = listed.of_all_channels();
+    let wanted: BTreeSet<&str> = tiles.iter().map(|tile| &*tile.known_as).collect();
+    let unsolved = Acquisition::new(folder, images, list, tiles, None)?;
+    if wanted.len() < tiles.len() {
         // Names that mean several tiles cannot be looked up in a solution.
         return Ok(unsolved);
     }
@@ -345,7 +346,7 @@ fn with_solution(
         listed.solution.as_ref(),
     ) {
         None => Ok(unsolved),
-        Some(best) => Acquisition::new(folder, images, list, &listed.tiles, Some(&best)),
+        Some(best) => Acquisition::new(folder, images, list, tiles, Some(&best)),
     }
 }
 

@@ -68,6 +68,8 @@ pub(crate) struct Listed {
     pub(crate) section: u32,
     /// Width and height \[pixels\], if the list says so.
     pub(crate) size: Option<UVec2>,
+    /// The channel that it shows, if the list says so.
+    pub(crate) channel: Option<String>,
 }
 
 impl Listed {
@@ -86,13 +88,17 @@ impl From<ListedTile> for Listed {
             laid_out: None,
             section: tile.section,
             size: None,
+            channel: None,
         }
     }
 }
 
 /// Tiles with the places that the stage had for them, and what the same program says of them.
 pub(crate) struct List {
+    /// Without a channel each.
     pub(crate) tiles: Vec<Listed>,
+    /// The same, or others, for each channel that they show, if the list says so.
+    pub(crate) channels: Option<Vec<Listed>>,
     pub(crate) solution: Option<Solution>,
     /// What its stage counts, where that is not certain.
     pub(crate) stage: Option<Stage>,
@@ -105,10 +111,16 @@ impl List {
         let (tiles, note) = twice::lines_once(tiles, path);
         Self {
             tiles: tiles.into_iter().map(Listed::from).collect(),
+            channels: None,
             solution,
             stage: None,
             notes: note.into_iter().collect(),
         }
+    }
+
+    /// The tiles, for each channel that they show.
+    pub(crate) fn of_all_channels(&self) -> &[Listed] {
+        self.channels.as_ref().unwrap_or(&self.tiles)
     }
 
     /// Says what of it does not count.
@@ -117,6 +129,17 @@ impl List {
             log::warn!("{note}");
         }
     }
+}
+
+/// Each name once, in the order in which they come.
+pub(crate) fn channel_names<'a>(all: impl Iterator<Item = Option<&'a str>>) -> Vec<String> {
+    let mut names: Vec<String> = Vec::new();
+    for name in all.flatten() {
+        if !names.iter().any(|known| known == name) {
+            names.push(name.to_owned());
+        }
+    }
+    names
 }
 
 /// Whether a file is what Fiji made of the list beside it.
@@ -245,18 +268,18 @@ fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
     }
 }
 
-/// What solutions call the tiles of specifications: by their images, but by their ids where several tiles have images of
-/// one name.
-fn known_as(specs: &[TileSpec]) -> Vec<String> {
-    let mut of_name: HashMap<&str, usize> = HashMap::new();
-    for spec in specs {
-        *of_name.entry(spec.name()).or_default() += 1;
+/// Tells apart what solutions call tiles: by their images, but by other words where several tiles have images of one name.
+fn tell_apart(tiles: &mut [Listed], otherwise: &[String]) {
+    let mut of_name: HashMap<String, usize> = HashMap::new();
+    for tile in &*tiles {
+        *of_name.entry(tile.stem().to_owned()).or_default() += 1;
     }
-    let known_as = |spec: &TileSpec| match of_name[spec.name()] {
-        1 => spec.name().to_owned(),
-        _ => spec.id.clone(),
-    };
-    specs.iter().map(known_as).collect()
+    for (tile, otherwise) in tiles.iter_mut().zip(otherwise) {
+        tile.known_as = match of_name[tile.stem()] {
+            1 => tile.stem().to_owned(),
+            _ => otherwise.clone(),
+        };
+    }
 }
 
 /// Of tiles that know no stage, or one that does not count pixels as far as can be told, the transform says roughly where it was.
@@ -270,17 +293,52 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
             path.display()
         ));
     }
-    let known_as = known_as(&specs);
-    let tiles = specs.iter().zip(&known_as).map(|(spec, known_as)| Listed {
-        file: spec.file.clone(),
-        known_as: known_as.clone(),
+    let listed = |spec: &TileSpec, file: &str, channel: Option<&str>| Listed {
+        file: file.to_owned(),
+        known_as: String::new(),
         corner: { spec.stage.filter(|_| stage == Stage::Pixels) }
             .unwrap_or_else(|| transformed_corner(spec)),
         laid_out: spec.stage,
         section: spec.section,
         size: Some(spec.size),
+        channel: channel.map(ToOwned::to_owned),
+    };
+    let mut tiles: Vec<_> = specs
+        .iter()
+        .map(|spec| listed(spec, &spec.file, None))
+        .collect();
+    let ids: Vec<_> = specs.iter().map(|spec| spec.id.clone()).collect();
+    tell_apart(&mut tiles, &ids);
+    let places = tiles
+        .iter()
+        .zip(&specs)
+        .map(|(tile, spec)| (tile.known_as.clone(), spec.transform));
+    let mut transforms: BTreeMap<_, _> = places.collect();
+    let channels = specs.iter().any(|spec| !spec.channels.is_empty()).then(|| {
+        let (mut tiles, mut ids, mut places) = (Vec::new(), Vec::new(), Vec::new());
+        for spec in &specs {
+            for channel in &spec.channels {
+                tiles.push(listed(spec, &channel.file, Some(&channel.name)));
+                ids.push(format!("{} {}", spec.id, channel.name));
+            }
+            if spec.channels.is_empty() {
+                tiles.push(listed(spec, &spec.file, None));
+                ids.push(spec.id.clone());
+            }
+            places.resize(tiles.len(), spec.transform);
+        }
+        let none = specs.iter().filter(|spec| spec.channels.is_empty()).count();
+        if none > 0 {
+            notes.push(format!(
+                "{none} tiles name no channel, as others do, and show the first: {}",
+                path.display()
+            ));
+        }
+        tell_apart(&mut tiles, &ids);
+        let names = tiles.iter().map(|tile| tile.known_as.clone());
+        transforms.extend(names.zip(places));
+        tiles
     });
-    let tiles = tiles.collect();
     let mut left_out: Vec<&str> = specs
         .iter()
         .flat_map(|s| &s.left_out)
@@ -294,14 +352,12 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
             "only affine transforms are used; left out: {kinds}: {path}"
         ));
     }
-    let transforms = known_as.into_iter().zip(&specs);
     List {
         tiles,
+        channels,
         solution: Some(Solution {
             path: path.to_owned(),
-            transforms: transforms
-                .map(|(name, spec)| (name, spec.transform))
-                .collect(),
+            transforms,
         }),
         stage: Some(stage),
         notes,

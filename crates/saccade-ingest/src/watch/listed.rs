@@ -10,6 +10,11 @@
 //! A list that names tiles no more may be half of one that is being written. Nothing of it counts before it has rested for
 //! [`ListConfig::drop_after`].
 //!
+//! # Channels
+//!
+//! Tile specifications of Render name an image for each channel; else the images' names may say it, as a pattern reads
+//! them. Which channels there are is settled with the frame. A volume that was begun without any goes on so.
+//!
 //! # Frame
 //!
 //! Lists count pixels from anywhere. Where the volume's corner and its first section lie, and how large it is, is
@@ -29,7 +34,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use glam::{DVec2, UVec2};
-use saccade_archive::acquisition::AcquisitionError;
+use saccade_archive::acquisition::{AcquisitionError, ChannelRef};
 use saccade_core::transform::SectionFromTile;
 
 use super::again::Again;
@@ -42,6 +47,7 @@ use frame::Frame;
 use index::{Index, Sought, base, key};
 use source::{Adopted, Files};
 
+mod channels;
 mod config;
 mod counted;
 mod follow;
@@ -70,6 +76,7 @@ struct Wanted {
     file: String,
     section: u32,
     transform: SectionFromTile,
+    channel: Option<ChannelRef>,
     image: Image,
 }
 
@@ -81,6 +88,7 @@ struct Told {
     section: u32,
     size: UVec2,
     transform: SectionFromTile,
+    channel: Option<ChannelRef>,
 }
 
 #[derive(Debug, Default)]
@@ -138,6 +146,8 @@ pub struct ListWatch<F> {
     unsolved_said: usize,
     /// Whether it was said why a solution is not used.
     unused_said: bool,
+    /// What is said of images whose names do not say the channel.
+    unfit: Option<String>,
     /// What was said of the list as it was read last.
     notes_said: Vec<String>,
     held_up: HeldUp,
@@ -203,6 +213,7 @@ impl<F: Folders> ListWatch<F> {
             dropping: None,
             unsolved_said: 0,
             unused_said: false,
+            unfit: None,
             notes_said: Vec::new(),
             held_up: HeldUp::default(),
             unread: VecDeque::new(),
@@ -288,6 +299,7 @@ impl<F: Folders> ListWatch<F> {
             ));
         }
         said.extend(self.unclear());
+        said.extend(self.unfit.clone());
         (!said.is_empty()).then(|| said.join("; "))
     }
 

@@ -30,15 +30,14 @@ enum Field {
 
 /// A pattern that cannot be.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "the pattern {pattern:?} {reason}; write it like s{{section}}/r{{row}}_c{{column}}.tif, with \
-     {{channel}} where there are several"
-)]
+#[error("the pattern {pattern:?} {reason}; write it like {example}")]
 pub struct PatternError {
     /// As given.
     pub pattern: String,
     /// What is wrong with it.
     pub reason: String,
+    /// One that can be.
+    pub example: &'static str,
 }
 
 /// What a name says.
@@ -71,6 +70,39 @@ impl Place {
 }
 
 impl Pattern {
+    /// One of names that say the channel alone, such as `{}_{channel}.tif`: numbers of sections, rows and columns must be
+    /// there where it has such, and do not matter.
+    ///
+    /// # Errors
+    ///
+    /// [`PatternError`].
+    pub fn of_channels(pattern: &str) -> Result<Self, PatternError> {
+        let example = "{}_{channel}.tif or {channel}/{}";
+        let (parts, named) = parsed(pattern, example)?;
+        if !named.contains(&"channel") {
+            return Err(PatternError {
+                pattern: pattern.to_owned(),
+                reason: "does not say where the name of the {channel} is".to_owned(),
+                example,
+            });
+        }
+        Ok(Self { parts })
+    }
+
+    /// The channel that a path says, by its last parts; or why it fits no part of this.
+    pub(super) fn channel(&self, path: &str) -> Result<String, String> {
+        let names: Vec<&str> = { path.split(['/', '\\']) }
+            .filter(|name| !name.is_empty())
+            .collect();
+        let last = names.len().saturating_sub(self.parts.len());
+        let names = &names[last..];
+        let mut place = Place::default();
+        let fits = names.len() == self.parts.len() && { names.iter().zip(&self.parts) }
+            .all(|(name, part)| fit(part, name, &mut place).is_ok());
+        let channel = place.channel.filter(|_| fits);
+        channel.ok_or_else(|| self.mismatch(&names.join("/"), false).unwrap_or_default())
+    }
+
     /// Folders above a file.
     pub fn depth(&self) -> usize {
         self.parts.len() - 1
@@ -207,56 +239,71 @@ impl FromStr for Pattern {
     type Err = PatternError;
 
     fn from_str(pattern: &str) -> Result<Self, PatternError> {
-        let wrong = |reason: &str| PatternError {
-            pattern: pattern.to_owned(),
-            reason: reason.to_owned(),
-        };
-        let mut parts = Vec::new();
-        let mut named = Vec::new();
-        for part in pattern.split('/') {
-            if matches!(part, "" | "." | "..") {
-                return Err(wrong("has a folder without a name"));
-            }
-            let mut pieces: Vec<Piece> = Vec::new();
-            let mut rest = part;
-            while !rest.is_empty() {
-                let text = rest.split('{').next().unwrap_or_default();
-                if !text.is_empty() {
-                    pieces.push(Piece::Text(text.to_owned()));
-                    rest = &rest[text.len()..];
-                    continue;
-                }
-                let Some((field, after)) = rest[1..].split_once('}') else {
-                    return Err(wrong("has a { without its }"));
-                };
-                let piece = match field {
-                    "section" => Piece::Number(Field::Section),
-                    "row" => Piece::Number(Field::Row),
-                    "column" => Piece::Number(Field::Column),
-                    "channel" => Piece::Channel,
-                    "" => Piece::Anything,
-                    _ => return Err(wrong(&format!("has an unknown field {{{field}}}"))),
-                };
-                if !field.is_empty() && named.contains(&field) {
-                    return Err(wrong(&format!("says {{{field}}} twice")));
-                }
-                if pieces
-                    .last()
-                    .is_some_and(|last| !matches!(last, Piece::Text(_)))
-                {
-                    return Err(wrong("has two fields with nothing between them"));
-                }
-                named.push(field);
-                pieces.push(piece);
-                rest = after;
-            }
-            parts.push(pieces);
-        }
+        let example = "s{section}/r{row}_c{column}.tif, with {channel} where there are several";
+        let (parts, named) = parsed(pattern, example)?;
         if !named.contains(&"section") {
-            return Err(wrong("does not say where the number of the {section} is"));
+            return Err(PatternError {
+                pattern: pattern.to_owned(),
+                reason: "does not say where the number of the {section} is".to_owned(),
+                example,
+            });
         }
         Ok(Self { parts })
     }
+}
+
+/// The parts of a pattern, and the fields that it names.
+fn parsed<'a>(
+    pattern: &'a str,
+    example: &'static str,
+) -> Result<(Vec<Vec<Piece>>, Vec<&'a str>), PatternError> {
+    let wrong = |reason: &str| PatternError {
+        pattern: pattern.to_owned(),
+        reason: reason.to_owned(),
+        example,
+    };
+    let mut parts = Vec::new();
+    let mut named = Vec::new();
+    for part in pattern.split('/') {
+        if matches!(part, "" | "." | "..") {
+            return Err(wrong("has a folder without a name"));
+        }
+        let mut pieces: Vec<Piece> = Vec::new();
+        let mut rest = part;
+        while !rest.is_empty() {
+            let text = rest.split('{').next().unwrap_or_default();
+            if !text.is_empty() {
+                pieces.push(Piece::Text(text.to_owned()));
+                rest = &rest[text.len()..];
+                continue;
+            }
+            let Some((field, after)) = rest[1..].split_once('}') else {
+                return Err(wrong("has a { without its }"));
+            };
+            let piece = match field {
+                "section" => Piece::Number(Field::Section),
+                "row" => Piece::Number(Field::Row),
+                "column" => Piece::Number(Field::Column),
+                "channel" => Piece::Channel,
+                "" => Piece::Anything,
+                _ => return Err(wrong(&format!("has an unknown field {{{field}}}"))),
+            };
+            if !field.is_empty() && named.contains(&field) {
+                return Err(wrong(&format!("says {{{field}}} twice")));
+            }
+            if pieces
+                .last()
+                .is_some_and(|last| !matches!(last, Piece::Text(_)))
+            {
+                return Err(wrong("has two fields with nothing between them"));
+            }
+            named.push(field);
+            pieces.push(piece);
+            rest = after;
+        }
+        parts.push(pieces);
+    }
+    Ok((parts, named))
 }
 
 impl fmt::Display for Pattern {

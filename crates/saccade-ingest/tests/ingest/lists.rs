@@ -1,5 +1,6 @@
 //! Folders whose tiles a list names: every kind of list, lists that change, and processes that are killed meanwhile.
 
+mod channels;
 mod power_cuts;
 mod refused;
 mod registration;
@@ -34,6 +35,8 @@ fn config(list: &Path) -> ListConfig {
         voxel_nm: VOXEL,
         extent: None,
         dtype: None,
+        channels: None,
+        channel_in: None,
         origin: None,
         first: None,
         scale: 1.0,

@@ -69,9 +69,15 @@ pub(crate) struct Bare {
     #[arg(long, value_name = "NUMBER")]
     first: Option<u32>,
 
-    /// Names of the channels, in order, with --pattern [default: one without a name, as of a list]
+    /// Names of the channels, in order, with --pattern or a list [default: one without a name, or those that the list names
+    /// at first]
     #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
     channels: Vec<String>,
+
+    /// Where the names of a list's images say the channel, such as '{}_{channel}.tif' or '{channel}/{}' [default: as tile
+    /// specifications of Render name images of several channels, or one channel]
+    #[arg(long, value_name = "PATTERN", value_parser = Pattern::of_channels, conflicts_with = "pattern")]
+    channel_in: Option<Pattern>,
 
     /// Bits of a voxel, 8 or 16, with --pattern or a list [default: 8, or as the images have that are listed at first]
     #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u8).range(8..=16))]
@@ -131,13 +137,6 @@ impl Bare {
                     }
                     return Err(nothing.into());
                 };
-                ensure!(
-                    self.channels.is_empty(),
-                    "lists know no channels: leave --channels out, and take the images of each channel in as a volume of \
-                     their own (--volume NAME, with a list of their own); or say with --pattern how file names tell the \
-                     channel, or with records (tiles.jsonl) which one each image is of: {}",
-                    list.display()
-                );
                 let config = self.listed(list, name)?;
                 say(&format!(
                     "the places are those of {}",
@@ -188,6 +187,7 @@ impl Bare {
             (self.bits.is_some(), "--bits"),
             (self.drop_after.is_some(), "--drop-after"),
             (!self.channels.is_empty(), "--channels"),
+            (self.channel_in.is_some(), "--channel-in"),
         ];
         let first = given.into_iter().find(|(given, _)| *given);
         first.map(|(_, option)| option)
@@ -239,6 +239,8 @@ impl Bare {
             voxel_nm,
             extent: self.extent,
             dtype: self.dtype()?,
+            channels: (!self.channels.is_empty()).then(|| self.channels.clone()),
+            channel_in: self.channel_in.clone(),
             origin: self.origin,
             first: self.first,
             scale: self.pixel.unwrap_or(1.0),
@@ -249,6 +251,11 @@ impl Bare {
             }),
             budget: WatchConfig::BUDGET,
         };
+        let mut info = AcquisitionInfo::new(name, UVec3::ONE, voxel_nm);
+        info.channels.clone_from(&self.channels);
+        if let Some(mistake) = info.channel_mistake() {
+            bail!("{mistake}; name each once with --channels");
+        }
         ensure!(
             config.list.is_file(),
             "the list of tiles is not there; name another with --list: {}",

@@ -173,10 +173,9 @@ fn what_a_list_cannot_say_or_change_is_told() {
     ];
     let channels = run([&ingest[..], &["--channels", "SE,BSE"]].concat());
     let ways = [
-        "lists know no channels",
-        "--volume NAME",
-        "--pattern",
-        "tiles.jsonl",
+        "does not say of which of the channels",
+        "--channel-in",
+        "leave --channels out",
     ];
     assert_failed(&channels, 1, &ways);
     let nothing = ["ingest", text(&empty), text(&archive), "--origin", "3,4"];

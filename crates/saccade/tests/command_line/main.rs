@@ -13,6 +13,7 @@ mod failing_volume;
 mod images;
 mod kills;
 mod labels;
+mod list_channels;
 mod lists;
 mod no_effect;
 #[allow(dead_code, reason = "others use more of it")]

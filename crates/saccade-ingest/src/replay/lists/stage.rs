@@ -83,6 +83,7 @@ mod tests {
             stage: Some(DVec2::from_array(*stage)),
             transform: SectionFromTile::translation(DVec2::from_array(*there)),
             left_out: Vec::new(),
+            channels: Vec::new(),
         };
         Stage::of(&places.iter().map(spec).collect::<Vec<_>>())
     }
@@ -104,6 +105,7 @@ mod tests {
                 stage: None,
                 transform: SectionFromTile::IDENTITY,
                 left_out: Vec::new(),
+                channels: Vec::new(),
             }
         };
         assert_eq!(Stage::of(&[none.clone(), none]), Stage::Unknown);

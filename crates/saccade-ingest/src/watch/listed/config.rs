@@ -8,8 +8,8 @@ use glam::{DVec2, DVec3, UVec3};
 use saccade_archive::acquisition::AcquisitionError;
 use saccade_core::volume::Dtype;
 
-use super::super::WatchError;
 use super::super::looking::Passes;
+use super::super::{Pattern, WatchError};
 use super::source;
 use crate::replay::ReplayError;
 
@@ -27,6 +27,11 @@ pub struct ListConfig {
     pub extent: Option<UVec3>,
     /// Type of the voxels; as the images say that are there at first if `None`.
     pub dtype: Option<Dtype>,
+    /// Names of the channels; those that the list names at first if `None`.
+    pub channels: Option<Vec<String>>,
+    /// How the images' names say the channel, as [`Pattern::of_channels`] reads it; if `None`, as tile specifications of
+    /// Render say, or all of the first.
+    pub channel_in: Option<Pattern>,
     /// Where the list has the volume's corner \[pixels\]; the low corner of the tiles listed at first if `None`.
     pub origin: Option<DVec2>,
     /// Number of the first section; that of the tiles listed at first if `None`.
@@ -55,12 +60,12 @@ impl ListConfig {
     ///
     /// # Errors
     ///
-    /// [`ListError::List`].
+    /// [`ListError::List`], [`ListError::Unfit`], [`ListError::Channels`].
     pub fn check(&self) -> Result<(), ListError> {
-        match source::read(&self.list) {
-            Ok(_) => Ok(()),
-            Err(e) => Err(ListError::List { source: e.into() }),
-        }
+        let listing = source::read(self, true);
+        let listing = listing.map_err(|e| ListError::List { source: e.into() })?;
+        listing.check_fit(self)?;
+        listing.check_channels(self)
     }
 }
 
@@ -82,6 +87,31 @@ pub enum ListError {
     Gone {
         /// The list.
         path: PathBuf,
+    },
+    /// It is not said of which channel the images are.
+    #[error(
+        "the list does not say of which of the channels its images are: say with --channel-in where their names tell it, \
+         such as --channel-in '{{}}_{{channel}}.tif', or leave --channels out: {}",
+        list.display()
+    )]
+    Channels {
+        /// The list.
+        list: PathBuf,
+    },
+    /// No image's name says its channel.
+    #[error(
+        "no image that the list names fits --channel-in {pattern}, such as {first:?}: {why}; give it as they are named: {}",
+        list.display()
+    )]
+    Unfit {
+        /// The pattern.
+        pattern: String,
+        /// The first image.
+        first: String,
+        /// Why it does not fit.
+        why: String,
+        /// The list.
+        list: PathBuf,
     },
     /// The list names nothing.
     #[error(
@@ -147,10 +177,12 @@ impl ListError {
         match self {
             Self::Watch(error) => Passes::of(error),
             // Somebody may be about to mend it.
-            Self::List { .. } | Self::Gone { .. } | Self::Empty { .. } | Self::NoImages { .. } => {
-                Passes::Soon
-            }
-            Self::Sections { .. } | Self::Frame(_) => Passes::Never,
+            Self::List { .. }
+            | Self::Gone { .. }
+            | Self::Empty { .. }
+            | Self::NoImages { .. }
+            | Self::Unfit { .. } => Passes::Soon,
+            Self::Sections { .. } | Self::Channels { .. } | Self::Frame(_) => Passes::Never,
         }
     }
 }

@@ -60,6 +60,7 @@ impl<F: Folders> Looks for ListWatch<F> {
         let said = [
             self.dropping.as_ref(),
             self.missing_said.as_ref().or(unclear),
+            self.unfit.as_ref().filter(|_| self.missing_said.is_none()),
         ];
         let said: Vec<&str> = said.into_iter().flatten().map(String::as_str).collect();
         (!said.is_empty()).then(|| said.join("; "))

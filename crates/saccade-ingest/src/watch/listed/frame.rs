@@ -39,6 +39,8 @@ pub(super) struct Frame {
     pub(super) first: u32,
     /// Size of a pixel \[voxels\].
     scale: f64,
+    /// How the images' names say the channel.
+    channel_in: Option<String>,
     /// In which pixels, where that is not certain.
     pub(super) counted: Option<Counted>,
 }
@@ -87,6 +89,7 @@ impl Frame {
             extent: config.extent.unwrap_or(there.extent),
             voxel_nm: config.voxel_nm,
             dtype: config.dtype.unwrap_or(there.dtype),
+            channels: { config.channels.clone() }.unwrap_or_else(|| there.channels.clone()),
             ..there.clone()
         });
         if let Some((there, now)) = info.as_ref().zip(now.as_ref()) {
@@ -106,6 +109,7 @@ impl Frame {
                 origin: config.origin.or(origin).unwrap_or_default(),
                 first: config.first.or(there.number("first")).unwrap_or(0),
                 scale: config.scale,
+                channel_in: config.channel_in.as_ref().map(ToString::to_string),
                 counted: there.text(COUNTED).and_then(Counted::parse),
             }
         });
@@ -127,8 +131,12 @@ impl Frame {
     fn settings(&self, folder: &Path) -> Settings {
         let list = shown(&self.list, folder);
         let settings = Settings::of_list(&list, self.origin.to_array(), self.first, self.scale);
-        match self.counted {
+        let settings = match self.counted {
             Some(counted) => settings.with(COUNTED, counted.text()),
+            None => settings,
+        };
+        match &self.channel_in {
+            Some(pattern) => settings.with("channel-in", pattern),
             None => settings,
         }
     }
@@ -148,6 +156,11 @@ impl Frame {
     /// Says that the volume's corner lies elsewhere in the list, by so much \[voxels\].
     pub(super) fn shift(&mut self, by: DVec2) {
         self.origin += by / self.scale;
+    }
+
+    /// Whether the volume has channels with names.
+    pub(super) fn has_channels(&self) -> bool {
+        !self.info.channels.is_empty()
     }
 
     /// Whether a tile would lie in the volume.
@@ -278,12 +291,14 @@ pub(super) fn begin(
         AcquisitionInfo::new(&config.name, extent.unwrap_or(UVec3::ONE), config.voxel_nm);
     let told = if deep { Dtype::Uint16 } else { Dtype::Uint8 };
     info.dtype = config.dtype.unwrap_or(told);
+    info.channels = { config.channels.clone() }.unwrap_or_else(|| listing.channels());
     let frame = Frame {
         info,
         list: config.list.clone(),
         origin: origin.unwrap_or_default(),
         first,
         scale: config.scale,
+        channel_in: config.channel_in.as_ref().map(ToString::to_string),
         counted: listing.counts.map(Counted::of),
     };
     Ok((frame, adopted))

@@ -6,10 +6,13 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use glam::{DVec2, UVec2};
-use saccade_archive::acquisition::{AcquisitionError, DeleteRecord, Record, TransformRecord};
+use saccade_archive::acquisition::{
+    AcquisitionError, ChannelRef, DeleteRecord, Record, TransformRecord,
+};
 use saccade_core::transform::SectionFromTile;
 
 use super::super::{BEFORE_FIRST, Folders};
+use super::frame::Frame;
 use super::index::{base, key};
 use super::source::{self, Listing, State, adopt, offset, raw, solution_again};
 use super::{Image, ListError, ListWatch, Tile, Trouble, Wanted, frame};
@@ -41,8 +44,10 @@ impl<F: Folders> ListWatch<F> {
             State::Changed(age) => age,
         };
         (self.trouble, self.dropping) = (None, None);
-        let mut listing = match source::read(&self.config.list) {
-            Ok(listing) if listing.tiles.is_empty() => {
+        // One that was begun without channels goes on so.
+        let channels = self.frame.as_ref().is_none_or(Frame::has_channels);
+        let mut listing = match source::read(&self.config, channels) {
+            Ok(listing) if listing.tiles.is_empty() && listing.unfit.is_none() => {
                 self.trouble = Some(Trouble::Empty);
                 self.files.are_read();
                 return self.troubled();
@@ -50,6 +55,15 @@ impl<F: Folders> ListWatch<F> {
             Ok(listing) => listing,
             Err(e) => return self.unreadable(e),
         };
+        listing.check_fit(&self.config)?;
+        if self.frame.is_none() {
+            listing.check_channels(&self.config)?;
+        }
+        let others = listing.tiles.len();
+        let pattern = self.config.channel_in.as_ref().map(ToString::to_string);
+        let unfit = listing.unfit.as_ref().zip(pattern);
+        self.unfit = unfit.map(|(unfit, pattern)| unfit.said(others, &pattern));
+        listing.notes.extend(self.unfit.clone());
         self.say_notes(std::mem::take(&mut listing.notes));
         let known: HashSet<&str> = listing.tiles.iter().map(|tile| &*tile.name).collect();
         let dropped =
@@ -255,6 +269,7 @@ impl<F: Folders> ListWatch<F> {
                 Some(told)
                     if self.index.is_still(&told.file, &named.file)
                         && (told.section, told.size == UVec2::ZERO) == (section, false)
+                        && told.channel == named.channel.clone().map(ChannelRef::Name)
                         && (frame.holds(section, told.size, told.transform)
                             || same_place(told.transform, transform)) =>
                 {
@@ -274,6 +289,7 @@ impl<F: Folders> ListWatch<F> {
                 file: named.file,
                 section,
                 transform,
+                channel: named.channel.map(ChannelRef::Name),
                 image,
             });
             if image == Image::Missing {

@@ -44,6 +44,7 @@ impl<F: Folders> ListWatch<F> {
                             section: tile.section,
                             size: tile.size,
                             transform: tile.transform,
+                            channel: tile.channel,
                         };
                         let name: Arc<str> = tile.tile.into();
                         let names = self.by_name.entry(key(base(&told.file))).or_default();
@@ -128,13 +129,14 @@ impl<F: Folders> ListWatch<F> {
                 section: wanted.section,
                 size,
                 transform: wanted.transform,
-                channel: None,
+                channel: wanted.channel.clone(),
             };
             wanted.image = Image::Told;
             *told = Some(Told {
                 section: wanted.section,
                 size,
                 transform: wanted.transform,
+                channel: wanted.channel.clone(),
                 file: file.clone(),
             });
             let seen = stamp.map(|stamp| {

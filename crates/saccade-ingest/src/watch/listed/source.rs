@@ -13,6 +13,8 @@ use saccade_archive::acquisition::{
 use saccade_core::transform::{SectionFromTile, TilePoint};
 
 use super::super::{Folders, Stamp};
+use super::ListConfig;
+use super::channels::Unfit;
 use crate::replay::RawTile;
 use crate::replay::acquisition::median_offset;
 use crate::replay::detect::{LARGEST_LIST, best};
@@ -35,6 +37,10 @@ pub(super) struct Named {
     pub(super) stage: SectionFromTile,
     /// Its corner as the stage has it, whatever that counts in.
     pub(super) laid_out: Option<DVec2>,
+    /// The channel that its image shows, if that is said.
+    pub(super) channel: Option<String>,
+    /// Which one of the list it is.
+    pub(super) order: usize,
 }
 
 /// What the files say.
@@ -45,6 +51,8 @@ pub(super) struct Listing {
     pub(super) own: Option<Solution>,
     /// What its stage counts, where that is not certain.
     pub(super) counts: Option<Stage>,
+    /// Images that are left out, since their names do not say the channel.
+    pub(super) unfit: Option<Unfit>,
     /// What of it does not count, or otherwise than it is written, in words.
     pub(super) notes: Vec<String>,
 }
@@ -61,8 +69,9 @@ impl Listing {
     }
 }
 
-/// Reads a list, or a TrakEM2 project as one.
-pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
+/// Reads a list, or a TrakEM2 project as one; with the channels that its images show, or without.
+pub(super) fn read(config: &ListConfig, channels: bool) -> Result<Listing, AcquisitionError> {
+    let path = &*config.list;
     // A pipe would be waited for.
     if path.metadata().is_ok_and(|meta| !meta.is_file()) {
         return Err(AcquisitionError::Read {
@@ -74,44 +83,56 @@ pub(super) fn read(path: &Path) -> Result<Listing, AcquisitionError> {
         .extension()
         .is_some_and(|e| e.eq_ignore_ascii_case("xml"));
     let mut taken = HashSet::new();
-    let mut unique = |file: &str| unique(tile_list::stem(file), file, &mut taken);
+    let mut unique = |file: &str, channel: Option<&str>| {
+        unique(tile_list::stem(file), file, channel, &mut taken)
+    };
     let mut listing = if is_xml {
         let patches = trakem2::read(path)?;
         let note = trakem2::left_out(&patches, path);
-        let named = patches.into_iter().map(|patch| Named {
-            name: unique(&patch.file),
+        let named = patches.into_iter().enumerate().map(|(order, patch)| Named {
+            name: unique(&patch.file, None),
             known_as: patch.name().to_owned(),
             section: patch.section,
             size: Some(patch.size),
             stage: patch.transform,
             laid_out: None,
+            channel: None,
+            order,
             file: patch.file,
         });
         Listing {
             tiles: named.collect(),
             own: None,
             counts: None,
+            unfit: None,
             notes: Vec::from_iter(note),
         }
     } else {
         let list = lists::read(path)?;
-        let named = list.tiles.into_iter().map(|tile| Named {
-            name: unique(&tile.file),
+        let tiles = list.channels.filter(|_| channels).unwrap_or(list.tiles);
+        let named = tiles.into_iter().enumerate().map(|(order, tile)| Named {
+            name: unique(&tile.file, tile.channel.as_deref()),
             known_as: tile.known_as,
             section: tile.section,
             size: tile.size,
             stage: SectionFromTile::translation(tile.corner),
             laid_out: tile.laid_out,
+            channel: tile.channel,
+            order,
             file: tile.file,
         });
         Listing {
             tiles: named.collect(),
             own: list.solution,
             counts: list.stage,
+            unfit: None,
             notes: list.notes,
         }
     };
     listing.tiles.sort_by_key(|tile| tile.section);
+    if channels {
+        listing.take_channels(config);
+    }
     Ok(listing)
 }
 
@@ -132,7 +153,7 @@ pub(super) fn line_of(list: &Path, tile: &Named) -> Option<usize> {
 }
 
 /// A name that no tile listed before has, so that what comes later in the list changes none.
-fn unique(stem: &str, file: &str, taken: &mut HashSet<String>) -> String {
+fn unique(stem: &str, file: &str, channel: Option<&str>, taken: &mut HashSet<String>) -> String {
     let safe = |text: &str| -> String {
         let fit = |c: char| {
             if c.is_alphanumeric() || "-_.".contains(c) {
@@ -146,7 +167,9 @@ fn unique(stem: &str, file: &str, taken: &mut HashSet<String>) -> String {
     let whole = file.trim_start_matches(['/', '.', '\\']);
     let whole = whole.rsplit_once('.').map_or(whole, |(before, _)| before);
     let again = (2..).map(|n: u64| format!("{}-{n}", safe(whole)));
-    let mut names = [safe(stem), safe(whole)].into_iter().chain(again);
+    let of_channel = channel.map(|channel| safe(&format!("{stem}_{channel}")));
+    let names = [Some(safe(stem)), of_channel, Some(safe(whole))];
+    let mut names = names.into_iter().flatten().chain(again);
     let name = names.find(|name| !name.is_empty() && !taken.contains(name));
     let name = name.unwrap_or_default();
     taken.insert(name.clone());
@@ -179,6 +202,7 @@ pub(super) fn raw(tiles: &[Named], size: impl Fn(usize) -> UVec2) -> Vec<RawTile
         size: size(n),
         stage: tile.stage,
         aligned: None,
+        channel: None,
     });
     raw.collect()
 }
@@ -330,7 +354,7 @@ mod tests {
     #[test]
     fn what_is_listed_later_changes_no_name() {
         let mut taken = HashSet::new();
-        let mut name = |stem: &str, file: &str| unique(stem, file, &mut taken);
+        let mut name = |stem: &str, file: &str| unique(stem, file, None, &mut taken);
         let names = [
             name("a", "x/a.tif"),
             name("a", "y/a.tif"),
@@ -340,5 +364,9 @@ mod tests {
             name("a", "y/a.tif"),
         ];
         assert_eq!(names, ["a", "y_a", "a_b", "y_a-2", "_", "y_a-3"]);
+        // Channels are told apart by their names.
+        let names =
+            [Some("SE"), Some("BSE")].map(|channel| unique("c", "z/c.tif", channel, &mut taken));
+        assert_eq!(names, ["c", "c_BSE"]);
     }
 }

@@ -1,0 +1,95 @@
+//! Which channels the images of a list show.
+
+use super::source::{Listing, Named};
+use super::{ListConfig, ListError};
+use crate::replay::lists::channel_names;
+
+/// Images of which the names do not say the channel.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Unfit {
+    count: usize,
+    first: String,
+    why: String,
+}
+
+impl Unfit {
+    /// What is said of them, beside so many others.
+    pub(super) fn said(&self, others: usize, pattern: &str) -> String {
+        let Self { count, first, why } = self;
+        let all = count + others;
+        format!(
+            "{count} of the {all} images that the list names do not fit --channel-in {pattern}, such as {first:?}: {why}"
+        )
+    }
+}
+
+impl Listing {
+    /// The channels that it names, in the order in which it does.
+    pub(super) fn channels(&self) -> Vec<String> {
+        let mut tiles: Vec<&Named> = self.tiles.iter().collect();
+        tiles.sort_by_key(|tile| tile.order);
+        channel_names(tiles.into_iter().map(|tile| tile.channel.as_deref()))
+    }
+
+    /// Takes the channels from the names of the images; those that do not say one are left out.
+    pub(super) fn take_channels(&mut self, config: &ListConfig) {
+        let Some(pattern) = &config.channel_in else {
+            return;
+        };
+        let mut unfit: Option<Unfit> = None;
+        self.tiles.retain_mut(|tile| {
+            if tile.channel.is_some() {
+                return true;
+            }
+            match pattern.channel(&tile.file) {
+                Ok(channel) => {
+                    tile.channel = Some(channel);
+                    true
+                }
+                Err(why) => {
+                    let unfit = unfit.get_or_insert_with(|| Unfit {
+                        count: 0,
+                        first: tile.file.clone(),
+                        why,
+                    });
+                    unfit.count += 1;
+                    false
+                }
+            }
+        });
+        self.unfit = unfit;
+    }
+
+    /// Whether any image is left.
+    ///
+    /// # Errors
+    ///
+    /// [`ListError::Unfit`].
+    pub(super) fn check_fit(&self, config: &ListConfig) -> Result<(), ListError> {
+        let unfit = self.unfit.as_ref().zip(config.channel_in.as_ref());
+        let Some((Unfit { first, why, .. }, pattern)) = unfit.filter(|_| self.tiles.is_empty())
+        else {
+            return Ok(());
+        };
+        Err(ListError::Unfit {
+            pattern: pattern.to_string(),
+            first: first.clone(),
+            why: why.clone(),
+            list: config.list.clone(),
+        })
+    }
+
+    /// Whether it can be told of which of several channels its images are.
+    ///
+    /// # Errors
+    ///
+    /// [`ListError::Channels`].
+    pub(super) fn check_channels(&self, config: &ListConfig) -> Result<(), ListError> {
+        let several = { config.channels.as_ref() }.is_some_and(|channels| channels.len() > 1);
+        if several && !self.tiles.is_empty() && self.channels().is_empty() {
+            let list = config.list.clone();
+            return Err(ListError::Channels { list });
+        }
+        Ok(())
+    }
+}

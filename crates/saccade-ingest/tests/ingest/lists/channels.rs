@@ -1,0 +1,202 @@
+//! Lists of images of several channels.
+
+use std::collections::BTreeMap;
+
+use saccade_archive::VisualizationArchive;
+use saccade_archive::acquisition::{AcquisitionInfo, ChannelRef, Record};
+use saccade_ingest::replay::{Input, detect};
+use saccade_ingest::watch::{ListConfig, Pattern};
+
+use super::{SIZE, Scope, config, roomy, write};
+use crate::scope::{VOLUME, archive};
+
+async fn channels(archive: &VisualizationArchive) -> BTreeMap<String, u32> {
+    let mut all = BTreeMap::new();
+    for z in archive.catalog().sections(VOLUME).await.unwrap() {
+        let tiles = archive.catalog().section_tiles(VOLUME, z).await.unwrap();
+        all.extend(tiles.into_iter().map(|tile| (tile.name, tile.channel)));
+    }
+    all
+}
+
+fn of(tiles: &[(&str, u32)]) -> BTreeMap<String, u32> {
+    let tiles = tiles.iter();
+    tiles
+        .map(|(name, channel)| ((*name).to_owned(), *channel))
+        .collect()
+}
+
+/// A specification with an image for each channel.
+fn spec(id: &str, channels: &[&str]) -> String {
+    let image = |file: String| {
+        format!(r#""mipmapLevels": {{"0": {{"imageUrl": "file:/far/{file}.tif"}}}}"#)
+    };
+    let named = |name: &&str| format!(r#"{{"name": "{name}", {}}}"#, image(format!("{id}_{name}")));
+    let channels: Vec<_> = channels.iter().map(named).collect();
+    format!(
+        r#"{{"tileId": "{id}", "z": 0, "width": {}, "height": {}, {}, "channels": [{}],
+            "transforms": {{"type": "list", "specList": [
+                {{"className": "mpicbg.trakem2.transform.AffineModel2D", "dataString": "1 0.01 0 1 3 0"}}]}}}}"#,
+        SIZE.x,
+        SIZE.y,
+        image(id.to_owned()),
+        channels.join(",")
+    )
+}
+
+/// Which channels there are is what the list names at first, in its order, unless it is said.
+#[tokio::test]
+async fn names_say_the_channel_and_the_order_of_the_list_theirs() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    let by_name = || ListConfig {
+        channel_in: Some(Pattern::of_channels("{}_{channel}.tif").unwrap()),
+        ..roomy(&list)
+    };
+    for (seed, name) in (1..).zip(["a_SE", "a_BSE", "b_SE", "b_BSE", "c_CL", "c"]) {
+        scope.image(name, seed);
+    }
+    let archive = archive(&scope.0.path().join("archive")).await;
+    // Of a later section, but first in the list.
+    let lines = "a_SE.tif 0 0 1\nb_BSE.tif 0 0 0\nb_SE.tif 0 0 0\n";
+    write(&list, lines);
+    scope.once(by_name(), &archive).await;
+    let info = AcquisitionInfo::read(&scope.kept()).unwrap();
+    assert_eq!(info.channels, ["SE", "BSE"]);
+    let first = [("a_SE", 0), ("b_BSE", 1), ("b_SE", 0)];
+    assert_eq!(channels(&archive).await, of(&first));
+
+    // One of another channel is set aside, one that says none left out; the rest goes on.
+    write(
+        &list,
+        format!("{lines}a_BSE.tif 0 0 1\nc_CL.tif 0 0 1\nc.tif 0 0 1\n"),
+    );
+    let watch = scope.once(by_name(), &archive).await;
+    let missing = watch.missing().unwrap();
+    drop(watch);
+    for said in [
+        "1 of the 6 images",
+        "c.tif",
+        "--channel-in {}_{channel}.tif",
+        "\"_\"",
+    ] {
+        assert!(missing.contains(said), "{missing}");
+    }
+    let all = [&first[..], &[("a_BSE", 1)]].concat();
+    assert_eq!(channels(&archive).await, of(&all));
+    let set_aside = archive.catalog().quarantined(VOLUME).await.unwrap();
+    assert_eq!(set_aside.len(), 1);
+    assert!(
+        set_aside[0].reason.contains("no such channel"),
+        "{set_aside:?}"
+    );
+    let told = scope.records().len();
+    drop(scope.once(by_name(), &archive).await);
+    assert_eq!(scope.records().len(), told, "nothing is told again");
+    // A list of which no name fits takes nothing out.
+    write(&list, "c.tif 0 0 1\n");
+    let mut watch = scope.watch(by_name());
+    let refused = saccade_ingest::watch::follow(
+        &mut watch,
+        saccade_ingest::watch::Until::End,
+        true,
+        &saccade_ingest::Cancel::new(),
+    );
+    let refused = refused.unwrap_err().to_string();
+    assert!(
+        refused.contains("no image that the list names fits"),
+        "{refused}"
+    );
+    assert_eq!(scope.records().len(), told);
+}
+
+/// Render's tiles name an image for each channel; a replay shows the same.
+#[tokio::test]
+async fn specifications_name_channels() {
+    let scope = Scope::new();
+    let list = scope.file("specs.json");
+    for (seed, name) in (1..).zip(["a", "a_PSD95", "a_DAPI", "b", "b_PSD95", "b_DAPI"]) {
+        scope.image(name, seed);
+    }
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let specs = |b: &[&str]| format!("[{},{}]", spec("a", &["PSD95", "DAPI"]), spec("b", b));
+    write(&list, specs(&["PSD95", "DAPI"]));
+    scope.once(config(&list), &archive).await;
+    let all = [("a_DAPI", 1), ("a_PSD95", 0), ("b_DAPI", 1), ("b_PSD95", 0)];
+    assert_eq!(channels(&archive).await, of(&all));
+    // Registration counts for each of them.
+    let records = scope.records();
+    for record in &records {
+        let Record::Tile(tile) = record else {
+            panic!("{record:?}")
+        };
+        assert_eq!(tile.transform.elements()[..4], [1.0, 0.01, 0.0, 1.0]);
+    }
+    let Input::Acquisition(replayed) = detect(&scope.path()).unwrap() else {
+        panic!("a list")
+    };
+    assert_eq!(replayed.channels, ["PSD95", "DAPI"]);
+    let tiles = replayed
+        .tiles
+        .iter()
+        .map(|tile| (tile.name.clone(), tile.channel.clone().unwrap()));
+    let names = ["PSD95", "DAPI"];
+    let want = of(&all)
+        .into_iter()
+        .map(|(name, n)| (name, names[n as usize].to_owned()));
+    assert_eq!(
+        tiles.collect::<BTreeMap<_, _>>(),
+        want.collect::<BTreeMap<_, _>>()
+    );
+    assert!(replayed.tiles.iter().all(|tile| tile.aligned.is_some()));
+}
+
+/// What an earlier version began, which knew no channels, shows what it showed.
+#[tokio::test]
+async fn a_volume_that_was_begun_without_channels_goes_on_so() {
+    let scope = Scope::new();
+    let list = scope.file("specs.json");
+    for (seed, name) in (1..).zip(["a", "a_PSD95", "a_DAPI", "b", "b_PSD95", "b_DAPI"]) {
+        scope.image(name, seed);
+    }
+    let archive = archive(&scope.0.path().join("archive")).await;
+    write(&list, format!("[{},{}]", spec("a", &[]), spec("b", &[])));
+    scope.once(config(&list), &archive).await;
+    assert_eq!(channels(&archive).await, of(&[("a", 0), ("b", 0)]));
+    let told = scope.records();
+    let named = ["PSD95", "DAPI"];
+    write(
+        &list,
+        format!("[{},{}]", spec("a", &named), spec("b", &named)),
+    );
+    scope.once(config(&list), &archive).await;
+    assert_eq!(scope.records(), told);
+}
+
+/// A channel that was spelt wrong in the list, and is mended, moves the image there.
+#[tokio::test]
+async fn an_image_that_is_of_another_channel_goes_there() {
+    let scope = Scope::new();
+    let list = scope.file("specs.json");
+    for (seed, name) in (1..).zip(["a_SE", "a_BSE", "x"]) {
+        scope.image(name, seed);
+    }
+    let swapped = |first: &str, second: &str| {
+        let text = spec("a", &["SE", "BSE"])
+            .replace("a_SE.tif", "one")
+            .replace("a_BSE.tif", "two");
+        format!("[{}]", text.replace("one", first).replace("two", second))
+    };
+    let archive = archive(&scope.0.path().join("archive")).await;
+    write(&list, swapped("a_SE.tif", "a_BSE.tif"));
+    scope.once(roomy(&list), &archive).await;
+    assert_eq!(channels(&archive).await, of(&[("a_SE", 0), ("a_BSE", 1)]));
+    write(&list, swapped("a_BSE.tif", "a_SE.tif"));
+    scope.once(roomy(&list), &archive).await;
+    assert_eq!(channels(&archive).await, of(&[("a_SE", 1), ("a_BSE", 0)]));
+    let last = scope.records().pop().unwrap();
+    let Record::Tile(last) = last else {
+        panic!("{last:?}")
+    };
+    assert!(matches!(last.channel, Some(ChannelRef::Name(_))));
+}
