@@ -83,11 +83,16 @@ struct Inner {
     watcher: watcher::Watcher,
     clock: OnceLock<Arc<dyn Clock>>,
     changes_kept: AtomicU64,
+    owner: identity::Owner,
 }
 
 impl Inner {
     /// Why nothing can be read, if the file was taken away.
     fn away(&self) -> Option<CatalogError> {
+        if self.owner.is_another() {
+            let location = self.location.clone();
+            return Some(CatalogError::Another { location });
+        }
         match &self.database {
             Database::Sqlite(opened) => opened.away().map(|away| CatalogError::Away {
                 why: away.why,
@@ -147,6 +152,7 @@ impl Catalog {
             watcher: watcher::Watcher::default(),
             clock: OnceLock::new(),
             changes_kept: AtomicU64::new(CHANGES_KEPT),
+            owner: identity::Owner::default(),
         };
         Self {
             inner: Arc::new(inner),
@@ -164,6 +170,14 @@ impl Catalog {
     pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
         drop(self.inner.clock.set(clock));
         self
+    }
+
+    /// The clock by which times are noted; those who work with the catalog wait and measure by it, too.
+    pub fn clock(&self) -> &dyn Clock {
+        match self.inner.clock.get() {
+            Some(clock) => &**clock,
+            None => &SystemClock,
+        }
     }
 
     /// Keeps at least so many changes of each volume, instead of [`CHANGES_KEPT`].
@@ -188,14 +202,6 @@ impl Catalog {
             }
             there => there?,
         };
-    /// The clock by which times are noted; those who work with the catalog wait and measure by it, too.
-    pub fn clock(&self) -> &dyn Clock {
-        match self.inner.clock.get() {
-            Some(clock) => &**clock,
-            None => &SystemClock,
-        }
-    }
-
         let differs = |what, existing: String, asked: String| {
             let same = existing == asked;
             let name = volume.name.clone();
@@ -331,13 +337,15 @@ impl Catalog {
         self.inner.watcher.follow(&self.inner);
     }
 
-    /// How often another file has taken the place of the one that was open. From then on that is read, whose revisions count
-    /// anew, and anything may be another; nothing can be written any more. Looked for several times a second from
+    /// How often another file has taken the place of the one that was open, or the right catalog that of another archive's,
+    /// see [`Self::belongs_to`]. From then on that is read, whose revisions count
+    /// anew, and anything may be another; to another file nothing can be written any more. Looked for several times a second from
     /// [`Self::follow`] or the first [`Self::subscribe`] on, whose receivers wake then.
     pub fn times_replaced(&self) -> u64 {
+        let back = self.inner.owner.times_back();
         match &self.inner.database {
-            Database::Sqlite(opened) => opened.times_replaced(),
-            Database::Postgres(_) => 0,
+            Database::Sqlite(opened) => opened.times_replaced() + back,
+            Database::Postgres(_) => back,
         }
     }
 
@@ -442,12 +450,14 @@ impl Catalog {
             });
         }
         self.look_for_file()?;
+        self.refuse_copied_over().await?;
         let begun = Transaction::begin(&self.inner.database, durability).await;
-        begun
-            .map_err(|e| self.failed(e))?
-            .ok_or_else(|| CatalogError::ReadOnly {
-                location: self.location().clone(),
-            })
+        let begun = begun.map_err(|e| self.failed(e))?;
+        let mut transaction = begun.ok_or_else(|| CatalogError::ReadOnly {
+            location: self.location().clone(),
+        })?;
+        self.refuse_another(&mut transaction).await?;
+        Ok(transaction)
     }
 
     /// Whether the open file is still the one of its name: SQLite goes on with one that was moved or deleted, and what it
@@ -475,6 +485,9 @@ impl Catalog {
     }
 
     async fn unknown_volume(&self, name: &str) -> CatalogError {
+        if let Err(another) = self.verify().await {
+            return another;
+        }
         let question = "SELECT name FROM volumes ORDER BY name";
         let legible = |row: &Row| Ok(rows::legible(row, "name"));
         match self.ask(question, &[], legible).await {

@@ -287,6 +287,16 @@ pub enum CatalogError {
         /// Where it was.
         location: CatalogLocation,
     },
+    /// What has the catalog's place now is the catalog of another archive.
+    #[error(
+        "the catalog of another archive has taken the place of this one, and nothing is read from it or written to it: put \
+         the right one back, with the -wal that was beside it if it was a file, and this goes on; to see the other archive, \
+         start anew with its own folder: {location}"
+    )]
+    Another {
+        /// Where it is.
+        location: CatalogLocation,
+    },
     /// Anything else; see the source.
     #[error("the catalog could not be read or written: {location}")]
     Database {
@@ -336,7 +346,8 @@ impl CatalogError {
             Self::Full { .. }
             | Self::Unreachable { .. }
             | Self::Locked { .. }
-            | Self::Away { .. } => true,
+            | Self::Away { .. }
+            | Self::Another { .. } => true,
             // SQLITE_IOERR.
             Self::Database { source, location } => match location {
                 CatalogLocation::File(_) => {
@@ -350,10 +361,13 @@ impl CatalogError {
         }
     }
 
-    /// Whether it passes only when somebody does something, however long that takes: frees space, or
-    /// starts the server.
+    /// Whether it passes only when somebody does something, however long that takes: frees space,
+    /// starts the server, or puts the right catalog back.
     pub fn is_outage(&self) -> bool {
-        matches!(self, Self::Full { .. } | Self::Unreachable { .. })
+        matches!(
+            self,
+            Self::Full { .. } | Self::Unreachable { .. } | Self::Another { .. }
+        )
     }
 
     /// Where the catalog is, if that is told.
@@ -376,6 +390,7 @@ impl CatalogError {
             | Self::Damaged { location, .. }
             | Self::Moved { location }
             | Self::Away { location, .. }
+            | Self::Another { location }
             | Self::SpoiltVolume { location, .. }
             | Self::SpoiltTile { location, .. }
             | Self::SpoiltCursor { location, .. }

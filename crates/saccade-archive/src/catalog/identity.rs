@@ -1,7 +1,105 @@
 //! What tells the archive of a catalog from every other.
 
-use super::database::Durability;
-use super::{Catalog, CatalogError};
+use std::sync::OnceLock;
+use std::sync::atomic::Ordering::{AcqRel, Acquire};
+use std::sync::atomic::{AtomicBool, AtomicU64};
+
+use sqlx::{ConnectOptions as _, Connection as _};
+
+use super::database::{Database, Durability, Row, Transaction};
+use super::{Catalog, CatalogError, Inner, sqlite};
+
+/// Asks whose a catalog is.
+const WHOSE: &str = "SELECT identity FROM archive WHERE part = 1";
+
+/// Whose the catalog must be, and whether what has its place is.
+#[derive(Debug, Default)]
+pub(super) struct Owner {
+    /// The archive's identity, once it is known.
+    identity: OnceLock<String>,
+    another: AtomicBool,
+    /// Times that the right one came back.
+    times_back: AtomicU64,
+}
+
+impl Owner {
+    /// Whether another archive's catalog was seen in its place, and not the right one since.
+    pub(super) fn is_another(&self) -> bool {
+        self.another.load(Acquire)
+    }
+
+    pub(super) fn times_back(&self) -> u64 {
+        self.times_back.load(Acquire)
+    }
+
+    /// Whether an identity is the right one. One of an earlier version has none.
+    fn is(&self, found: Option<&str>) -> bool {
+        match (self.identity.get(), found) {
+            (Some(right), Some(found)) => right == found,
+            _ => true,
+        }
+    }
+}
+
+impl Inner {
+    /// Looks whose the catalog is that is there now, and tells those who wait if that is news. Whether it is the right one.
+    pub(super) async fn look_whose(&self) -> Result<bool, sqlx::Error> {
+        if self.owner.identity.get().is_none() {
+            return Ok(true);
+        }
+        let rows = self.database.all(WHOSE, &[]).await?;
+        self.note_whose(&rows)
+    }
+
+    /// A file can be copied over the open one. Connections that are open do not notice; a new one does. `None` if the file
+    /// looks as it did when it was last known whose it is.
+    pub(super) async fn look_whose_afresh(&self) -> Result<Option<bool>, sqlx::Error> {
+        let (Database::Sqlite(file), Some(_)) = (&self.database, self.owner.identity.get()) else {
+            return Ok(None);
+        };
+        let Some(stamp) = file.new_stamp() else {
+            return Ok(None);
+        };
+        let access = match file.reading() {
+            sqlite::Access::Write => sqlite::Access::Read,
+            reading => reading,
+        };
+        let options = sqlite::options(&file.path, access);
+        let mut connection = options.connect().await?;
+        let found = sqlx::query_scalar(WHOSE).fetch_optional(&mut connection);
+        let found: Option<String> = found.await?;
+        connection.close().await?;
+        let right = self.owner.is(found.as_deref());
+        if right {
+            file.keep_stamp(stamp);
+        } else {
+            self.note_right(false);
+        }
+        Ok(Some(right))
+    }
+
+    /// By the answer to [`WHOSE`].
+    fn note_whose(&self, rows: &[Row]) -> Result<bool, sqlx::Error> {
+        let found = rows.first().map(|row| row.get::<String>("identity"));
+        let right = self.owner.is(found.transpose()?.as_deref());
+        self.note_right(right);
+        Ok(right)
+    }
+
+    fn note_right(&self, right: bool) {
+        if self.owner.another.swap(!right, AcqRel) != right {
+            return;
+        }
+        if right {
+            self.owner.times_back.fetch_add(1, AcqRel);
+            log::warn!("the right catalog is there again: {}", self.location);
+        } else {
+            let location = self.location.clone();
+            log::warn!("{}", CatalogError::Another { location });
+        }
+        self.watcher.begin_anew();
+    }
+}
 
 /// Pyramids that are looked for, where it is to be found out whether they are there.
 const SAMPLE: u32 = 16;
@@ -33,6 +131,53 @@ impl Catalog {
         transaction.commit().await.map_err(|e| self.failed(e))?;
         let now = self.identity().await?;
         Ok(now.unwrap_or_else(|| identity.to_owned()))
+    }
+
+    /// Says whose the catalog is. Should another archive's take its place while it is open, nothing of that is read or
+    /// written: all fails with [`CatalogError::Another`] until the right one is back. Has an effect once.
+    pub fn belongs_to(&self, identity: &str) {
+        let _the_first_counts = self.inner.owner.identity.set(identity.to_owned());
+    }
+
+    /// Looks whether the catalog is still the archive's, see [`Self::belongs_to`].
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::Another`], or what the database says.
+    pub async fn verify(&self) -> Result<(), CatalogError> {
+        let right = self.inner.look_whose().await;
+        self.or_another(right)
+    }
+
+    /// The same within a transaction, which cannot lose its place any more.
+    pub(super) async fn refuse_another(
+        &self,
+        transaction: &mut Transaction,
+    ) -> Result<(), CatalogError> {
+        if self.inner.owner.identity.get().is_none() {
+            return Ok(());
+        }
+        let rows = transaction.all(WHOSE, &[]).await;
+        self.or_another(rows.and_then(|rows| self.inner.note_whose(&rows)))
+    }
+
+    /// A file that was copied over the open one is refused.
+    pub(super) async fn refuse_copied_over(&self) -> Result<(), CatalogError> {
+        match self.inner.look_whose_afresh().await {
+            Ok(found) => self.or_another(Ok(found != Some(false))),
+            // It may have gone just now.
+            Err(e) => self.look_for_file().and(Err(self.failed(e))),
+        }
+    }
+
+    fn or_another(&self, right: Result<bool, sqlx::Error>) -> Result<(), CatalogError> {
+        match right {
+            Ok(true) => Ok(()),
+            Ok(false) => Err(CatalogError::Another {
+                location: self.location().clone(),
+            }),
+            Err(e) => Err(self.failed(e)),
+        }
     }
 
     /// As an earlier version left it.

@@ -4,18 +4,18 @@ use std::cmp::Ordering;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::sync::OnceLock;
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::atomic::{AtomicBool, AtomicU32};
-use std::time::Duration;
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::{Duration, SystemTime};
 
 use sqlx::migrate::{MigrateError, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
-
 use crate::clock::{Clock as _, SystemClock};
+
 mod replaced;
 
 use replaced::Replaced;
@@ -77,7 +77,12 @@ pub(super) struct Opened {
     logged: AtomicU32,
     /// Why nothing may be written any more: a sync failed.
     stopped: OnceLock<String>,
+    /// What the file looked like when it was last known whose it is.
+    stamp: Mutex<Option<Stamp>>,
 }
+
+/// Length, and when it was written.
+pub(super) type Stamp = (u64, SystemTime);
 
 /// Transactions in the write-ahead log from which on it is emptied: some megabytes.
 const MOST_LOGGED: u32 = 100;
@@ -95,6 +100,7 @@ impl Opened {
             // What is there from before is not known.
             logged: AtomicU32::new(MOST_LOGGED),
             stopped: OnceLock::new(),
+            stamp: Mutex::default(),
         }
     }
 
@@ -106,6 +112,21 @@ impl Opened {
     /// Why nothing may be written any more, if so.
     pub(super) fn stopped(&self) -> Option<&str> {
         self.stopped.get().map(String::as_str)
+    }
+
+    /// What the file looks like, if that is not as it was kept: what was in the log was moved to it, or another
+    /// was copied over it.
+    pub(super) fn new_stamp(&self) -> Option<Stamp> {
+        let meta = std::fs::metadata(&self.path).ok()?;
+        let now = (meta.len(), meta.modified().ok()?);
+        let kept = self.stamp.lock().unwrap_or_else(PoisonError::into_inner);
+        (*kept != Some(now)).then_some(now)
+    }
+
+    /// The file that looks so is known.
+    pub(super) fn keep_stamp(&self, stamp: Stamp) {
+        let mut kept = self.stamp.lock().unwrap_or_else(PoisonError::into_inner);
+        *kept = Some(stamp);
     }
 
     /// Whether the name is another file's by now, or nobody's. A disk that cannot be asked tells by itself.

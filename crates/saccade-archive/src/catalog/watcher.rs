@@ -11,7 +11,8 @@ use tokio::sync::watch;
 
 use super::database::Database;
 use super::sqlite::{Away, Place};
-use super::{Inner, postgres, rows, sqlite};
+use super::{CatalogError, Inner, postgres, rows, sqlite};
+use crate::clock::{Clock as _, SystemClock};
 
 /// How often to look for commits of other processes. Reading the counter costs some microseconds.
 const POLL: Duration = Duration::from_millis(150);
@@ -58,7 +59,7 @@ impl Watcher {
     }
 
     /// Wakes all subscribers: revisions count anew.
-    fn begin_anew(&self) {
+    pub(super) fn begin_anew(&self) {
         for sender in self.senders().values() {
             sender.send_replace(0);
         }
@@ -141,7 +142,9 @@ async fn hear(following: &Following, pool: &PgPool, lost: &mut bool) -> Result<(
             let Some(catalog) = following.catalog() else {
                 return Ok(());
             };
-            announce_all(&catalog).await?;
+            if catalog.look_whose().await? {
+                announce_all(&catalog).await?;
+            }
             if std::mem::take(lost) {
                 log::warn!("changes are heard again: {}", catalog.location);
             }
@@ -157,6 +160,7 @@ async fn hear(following: &Following, pool: &PgPool, lost: &mut bool) -> Result<(
                 };
                 if let Some((revision, volume)) = told.payload().split_once(' ')
                     && let Ok(revision) = revision.parse()
+                    && catalog.look_whose().await?
                 {
                     catalog.watcher.announce(volume, revision);
                 }
@@ -222,10 +226,19 @@ async fn is_in_place(
             if let Err(error) = file.open_again().await {
                 return tell_away(Some(error.without_place()));
             }
+            let right = match catalog.look_whose().await {
+                Ok(right) => right,
+                Err(e) => {
+                    let error = CatalogError::sort(e, location);
+                    return tell_away(Some(error.without_place()));
+                }
+            };
             file.set_away(None);
-            log::warn!(
-                "another file has taken the catalog's place, and is read from now on: {location}"
-            );
+            if right {
+                log::warn!(
+                    "another file has taken the catalog's place, and is read from now on: {location}"
+                );
+            }
             catalog.watcher.begin_anew();
             true
         }
@@ -247,24 +260,35 @@ async fn look(
     file: &sqlite::Opened,
     connection: &mut Option<SqliteConnection>,
     seen: &mut Option<i64>,
-) -> Result<(), sqlx::Error> {
+) -> Result<(), CatalogError> {
+    let failed = |e| CatalogError::sort(e, &catalog.location);
+    match catalog.look_whose_afresh().await.map_err(failed)? {
+        Some(false) => return Ok(()),
+        // What is open knows nothing of what was copied over it.
+        Some(true) if catalog.owner.is_another() => {
+            *connection = None;
+            file.open_again().await?;
+        }
+        Some(true) | None => {}
+    }
     let connection = match connection {
         Some(connection) => connection,
         None => {
             // The counter only has meaning within one connection.
             *seen = None;
-            connection.insert(
-                sqlite::options(&file.path, file.reading())
-                    .connect()
-                    .await?,
-            )
+            let options = sqlite::options(&file.path, file.reading());
+            connection.insert(options.connect().await.map_err(failed)?)
         }
     };
     let version: i64 = sqlx::query_scalar("PRAGMA data_version")
         .fetch_one(&mut *connection)
-        .await?;
-    if seen.replace(version) == Some(version) {
+        .await
+        .map_err(failed)?;
+    if seen.replace(version) == Some(version) && !catalog.owner.is_another() {
         return Ok(());
     }
-    announce_all(catalog).await
+    if catalog.look_whose().await.map_err(failed)? {
+        announce_all(catalog).await.map_err(failed)?;
+    }
+    Ok(())
 }

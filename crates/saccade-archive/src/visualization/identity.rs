@@ -65,6 +65,14 @@ impl Parts {
         })
     }
 
+    /// Has the catalog know another archive's that takes its place.
+    fn remember(&self, catalog: &Catalog) {
+        match (&self.catalog, &self.storage) {
+            (Some(identity), _) | (None, Mark::Whole(identity)) => catalog.belongs_to(identity),
+            (None, Mark::None | Mark::Damaged) => {}
+        }
+    }
+
     /// Whether they belong together; `None` if they do not say.
     fn agree(&self) -> Option<bool> {
         match (&self.catalog, &self.storage) {
@@ -132,6 +140,7 @@ pub(super) async fn check(
     location: &ArchiveLocation,
 ) -> Result<(), ArchiveError> {
     let parts = meet(catalog, storage, location).await?;
+    parts.remember(catalog);
     if parts.storage == Mark::Damaged {
         log::warn!(
             "the object {IDENTITY:?} of {} is damaged; the next `saccade ingest` into it writes it anew",
@@ -146,16 +155,17 @@ pub(super) async fn make(
     catalog: &Catalog,
     storage: &dyn Storage,
     location: &ArchiveLocation,
+    randomness: &dyn Randomness,
 ) -> Result<(), ArchiveError> {
     let parts = meet(catalog, storage, location).await?;
     if parts.agree().is_some() {
+        parts.remember(catalog);
         return Ok(());
     }
     let there = match parts.storage {
         Mark::Whole(identity) => Some(identity),
         Mark::None => None,
         Mark::Damaged => {
-    randomness: &dyn Randomness,
             log::warn!(
                 "the object {IDENTITY:?} of {} was damaged, and is written anew: pyramids that its catalog names \
                  are there",
@@ -170,6 +180,7 @@ pub(super) async fn make(
         .or(parts.catalog)
         .unwrap_or_else(|| random(randomness));
     let identity = catalog.give_identity(&proposed).await?;
+    catalog.belongs_to(&identity);
     match there {
         Some(there) if there == identity => {}
         Some(_) => return Err(strangers(location)),
@@ -225,6 +236,7 @@ mod tests {
     use super::*;
     use crate::VisualizationArchive;
     use crate::catalog::NewTile;
+    use crate::randomness::SystemRandomness;
     use crate::storage::LocalStorage;
 
     /// An archive of one tile, as an earlier version made it if it is to have no identity.
@@ -236,7 +248,6 @@ mod tests {
         let pyramid = format!("tiles/{}", folder.file_name().unwrap().display());
         let tile = NewTile {
             name: "t".to_owned(),
-    use crate::randomness::SystemRandomness;
             section: 0,
             channel: 0,
             size: UVec2::splat(8),

@@ -16,6 +16,7 @@ mod server;
 mod spoilt;
 mod sqlite;
 mod suite;
+mod whose;
 mod workers;
 
 /// Each of these promises holds wherever a catalog is.
@@ -57,6 +58,7 @@ on_both! {
     spoilt::where_a_tile_of_no_size_lies_is_kept_until_it_has_one,
     spoilt::what_is_queued_and_cannot_be_understood_is_set_aside,
     spoilt::what_a_tile_names_is_not_on_the_list_of_what_is_to_be_deleted,
+    whose::another_archives_catalog_is_neither_read_nor_written,
     workers::workers_share_what_is_to_be_done,
     workers::a_dead_workers_claims_return,
     workers::a_sign_of_life_keeps_claims,

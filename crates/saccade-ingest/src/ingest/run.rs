@@ -244,6 +244,10 @@ impl Ingest<'_> {
 
     async fn follow(&mut self) -> Result<(), IngestError> {
         loop {
+            // Before anything is concluded from what the catalog says.
+            self.context
+                .retry(|| self.archive.catalog().verify())
+                .await?;
             let images = self.context.images;
             let due = self.room.due(images, self.options.batch);
             for notice in self.room.news(images) {

@@ -8,9 +8,9 @@ use std::time::Duration;
 use glam::UVec2;
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{AcquisitionError, Cursor, Record, RecordReader};
-use saccade_archive::catalog::Waiting;
-use saccade_ingest::Cancel;
+use saccade_archive::catalog::{Catalog, Waiting};
 use saccade_ingest::ingest::{IngestError, IngestOptions, run};
+use saccade_ingest::{Cancel, HeldUp};
 
 use crate::scope::{Diary, Scope, VOLUME, archive, quick, seen, tile_record};
 
@@ -343,4 +343,63 @@ async fn catalogs_of_earlier_versions_learn_what_was_read() {
     assert_eq!(scope.ingest(&archive).await.tiles, 0);
     assert_eq!(archive.catalog().cursor(VOLUME).await.unwrap(), read);
     refused(acquired("b", 7).path(), &archive).await;
+}
+
+/// As where a backup of another archive's catalog was restored over it.
+#[tokio::test]
+async fn nothing_is_entered_in_another_archives_catalog_and_work_goes_on_in_the_right_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path()).await;
+    let scope = acquired("a", 1);
+    let (cancel, held_up) = (Cancel::new(), HeldUp::default());
+    let options = IngestOptions {
+        once: false,
+        held_up: Some(held_up.clone()),
+        ..quick()
+    };
+    let ingest = run(scope.path(), &archive, &options, &(), &cancel);
+    let catalog = archive.catalog();
+    let look = async {
+        let wait = Duration::from_millis(5);
+        let tiles = async |of: &Catalog| of.entry(VOLUME).await.map_or(0, |entry| entry.tiles);
+        while tiles(catalog).await < 1 {
+            tokio::time::sleep(wait).await;
+        }
+        let ours = catalog.identity().await.unwrap().unwrap();
+        let path = folder.path().join(VisualizationArchive::CATALOG);
+        let becomes = async |identity: &str| {
+            let pool = sqlx::SqlitePool::connect(path.to_str().unwrap()).await;
+            let pool = pool.unwrap();
+            let query = sqlx::query("UPDATE archive SET identity = ?").bind(identity);
+            query.execute(&pool).await.unwrap();
+            pool.close().await;
+        };
+        becomes(&"f".repeat(32)).await;
+        scope.tile("late", 2, SIZE, 99);
+        let is_told = || {
+            let reasons = held_up.now();
+            { reasons.iter() }.any(|reason| {
+                reason.why.contains("catalog of another archive")
+                    && reason.why.contains("put the right one back")
+            })
+        };
+        while !is_told() {
+            tokio::time::sleep(wait).await;
+        }
+        let theirs = Catalog::open(path.as_path()).await.unwrap();
+        tokio::time::sleep(40 * wait).await;
+        assert_eq!(tiles(&theirs).await, 1);
+        theirs.close().await;
+        becomes(&ours).await;
+        while tiles(catalog).await < 2 {
+            tokio::time::sleep(wait).await;
+        }
+        while is_told() {
+            tokio::time::sleep(wait).await;
+        }
+        cancel.cancel();
+    };
+    let both = async { futures::join!(ingest, look).0 };
+    let done = tokio::time::timeout(Duration::from_secs(120), both).await;
+    assert_eq!(done.expect("it goes on").unwrap().tiles, 2);
 }

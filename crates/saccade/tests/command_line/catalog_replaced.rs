@@ -7,7 +7,7 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::Catalog;
 use saccade_core::volume::Volume;
 
-use super::answers::Client;
+use super::answers::{Answer, Client};
 use super::{Running, archive, saccade};
 
 fn files(archive: &str) -> [PathBuf; 3] {
@@ -55,4 +55,44 @@ fn a_server_tells_that_its_catalog_is_away_and_serves_the_one_that_comes_instead
     client.until("v/phantom/status.json", |answer| {
         answer.json()["tiles"] == 0
     });
+}
+
+#[test]
+fn a_server_serves_nothing_of_another_archives_catalog_and_goes_on_with_the_right_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let [ours, theirs] = ["ours", "theirs"].map(|name| {
+        let folder = folder.path().join(name);
+        std::fs::create_dir(&folder).unwrap();
+        archive(&folder)
+    });
+    let mut command = saccade();
+    let (_server, url) = Running::start(command.args(["serve", &ours, "--port", "0"]));
+    let client = Client::of(&url);
+    let status = "v/phantom/status.json";
+    let before = client.until(status, |answer| answer.status == 200).json();
+    let [open, aside] = [files(&ours), files(&format!("{ours}/aside"))];
+    std::fs::create_dir(format!("{ours}/aside")).unwrap();
+    for (file, aside) in open.iter().zip(&aside) {
+        // What there is of them.
+        let _moved = std::fs::rename(file, aside);
+    }
+    std::fs::copy(&files(&theirs)[0], &open[0]).unwrap();
+    let told = |answer: &Answer| {
+        let cause = answer.json()["cause"].as_str().map(str::to_owned);
+        answer.status == 503 && cause.is_some_and(|cause| cause.contains("another archive"))
+    };
+    let away = client.until(status, told);
+    let (retry, answer) = (away.retry, away.json());
+    let cause = answer["cause"].as_str().unwrap();
+    assert!(
+        retry && cause.contains("put the right one back") && !cause.contains(&ours),
+        "{answer}"
+    );
+
+    for (file, aside) in open.iter().zip(&aside) {
+        let _removed = std::fs::remove_file(file);
+        let _moved = std::fs::rename(aside, file);
+    }
+    let after = client.until(status, |answer| answer.status == 200).json();
+    assert_eq!(after["tiles"], before["tiles"]);
 }

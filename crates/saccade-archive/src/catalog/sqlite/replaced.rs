@@ -281,4 +281,70 @@ mod tests {
         rename(&aside, &path);
         until(async || tiles().await.filter(|&tiles| tiles == 2)).await;
     }
+
+    /// Two catalogs of other archives.
+    async fn of_two_archives(path: &Path, other: &Path) -> Catalog {
+        let identities = ["a", "b"].map(|digit| digit.repeat(32));
+        for ((path, count), identity) in [(path, 3), (other, 1)].into_iter().zip(&identities) {
+            let catalog = with_tiles(path, count).await;
+            catalog.give_identity(identity).await.unwrap();
+            // Nothing is left in its log.
+            catalog.close().await;
+        }
+        let catalog = Catalog::open(path).await.unwrap();
+        catalog.belongs_to(&identities[0]);
+        catalog.follow();
+        catalog
+    }
+
+    async fn until_another(catalog: &Catalog) {
+        let another = async || match catalog.entry("v").await {
+            Ok(entry) => {
+                assert_eq!(entry.tiles, 3, "the other's");
+                None
+            }
+            Err(CatalogError::Another { .. }) => Some(()),
+            Err(error) => {
+                assert!(matches!(error, CatalogError::Away { .. }), "{error}");
+                None
+            }
+        };
+        until(another).await;
+    }
+
+    #[tokio::test]
+    async fn another_archives_file_is_not_read_and_the_right_one_is_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, aside, other] =
+            ["catalog.sqlite", "aside", "other"].map(|name| folder.path().join(name));
+        let catalog = of_two_archives(&path, &other).await;
+        rename(&path, &aside);
+        std::fs::copy(&other, &path).unwrap();
+        until_another(&catalog).await;
+        let refused = catalog.delete_tile("v", "0", 9).await.unwrap_err();
+        assert!(matches!(refused, CatalogError::Moved { .. }), "{refused}");
+        for file in files(&path) {
+            let _what_there_is_of_them = std::fs::remove_file(file);
+        }
+        rename(&aside, &path);
+        let tiles = until(async || catalog.entry("v").await.ok().map(|entry| entry.tiles));
+        assert_eq!(tiles.await, 3);
+        assert!(catalog.times_replaced() > 0, "anything may be another");
+    }
+
+    #[tokio::test]
+    async fn a_file_that_is_copied_over_the_open_one_is_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, copy, other] =
+            ["catalog.sqlite", "copy", "other"].map(|name| folder.path().join(name));
+        let catalog = of_two_archives(&path, &other).await;
+        std::fs::copy(&path, &copy).unwrap();
+        std::fs::copy(&other, &path).unwrap();
+        let refused = catalog.delete_tile("v", "0", 9).await.unwrap_err();
+        assert!(matches!(refused, CatalogError::Another { .. }), "{refused}");
+        until_another(&catalog).await;
+        std::fs::copy(&copy, &path).unwrap();
+        let tiles = until(async || catalog.entry("v").await.ok().map(|entry| entry.tiles));
+        assert_eq!(tiles.await, 3);
+    }
 }
