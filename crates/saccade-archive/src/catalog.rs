@@ -26,6 +26,7 @@
 //! each record by one of them, and tell from time to time that they live. What a dead one had claimed
 //! is free again when its lease is over. See [`Catalog::claim`].
 
+mod anew;
 mod commit;
 mod database;
 mod entries;
@@ -69,6 +70,22 @@ pub const CHANGES_AT_ONCE: usize = 4096;
 
 /// Changes that are kept of each volume, at least: the newest.
 pub const CHANGES_KEPT: u64 = 1 << 16;
+
+/// The tables that a catalog has.
+const TABLES: [&str; 12] = [
+    "volumes",
+    "tiles",
+    "early_transforms",
+    "quarantine",
+    "cursors",
+    "waiting",
+    "retired",
+    "sections",
+    "changes",
+    "workers",
+    "archive",
+    "held_up",
+];
 
 /// An open catalog. Clones share it.
 #[derive(Clone, Debug)]

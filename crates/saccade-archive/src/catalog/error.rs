@@ -297,6 +297,18 @@ pub enum CatalogError {
         /// Where it is.
         location: CatalogLocation,
     },
+    /// A table of the catalog's is not there.
+    #[error(
+        "the catalog has no table {table:?}: it was damaged, or changed by another program. Put a copy of the catalog in its \
+         place, from which `saccade ingest` goes on and `saccade check` says what it lacks; without a copy, {}: {location}",
+        without_copy(table)
+    )]
+    NoTable {
+        /// The table.
+        table: String,
+        /// Where the catalog is.
+        location: CatalogLocation,
+    },
     /// Anything else; see the source.
     #[error("the catalog could not be read or written: {location}")]
     Database {
@@ -335,7 +347,22 @@ impl CatalogError {
             Case::Unreachable => Self::Unreachable { source, location },
             Case::NoDatabase => Self::NoDatabase { source, location },
             Case::Login => Self::Login { source, location },
+            Case::NoTable(table) => Self::NoTable { table, location },
             Case::Other => Self::Database { source, location },
+        }
+    }
+
+    /// Refuses a database that has these tables, if it lacks one of a catalog's.
+    pub(super) fn refuse_without(there: &[String], location: &CatalogLocation) -> Result<(), Self> {
+        match super::TABLES
+            .iter()
+            .find(|table| there.iter().all(|name| name != *table))
+        {
+            None => Ok(()),
+            Some(table) => Err(Self::NoTable {
+                table: (*table).to_owned(),
+                location: location.clone(),
+            }),
         }
     }
 
@@ -391,6 +418,7 @@ impl CatalogError {
             | Self::Moved { location }
             | Self::Away { location, .. }
             | Self::Another { location }
+            | Self::NoTable { location, .. }
             | Self::SpoiltVolume { location, .. }
             | Self::SpoiltTile { location, .. }
             | Self::SpoiltCursor { location, .. }
@@ -428,6 +456,7 @@ enum Case {
     Unreachable,
     NoDatabase,
     Login,
+    NoTable(String),
     Other,
 }
 
@@ -442,6 +471,8 @@ fn sqlite_case(error: &sqlx::Error) -> Case {
         Some(11) => Case::Damaged,
         Some(13) => Case::Full,
         Some(26) => Case::Foreign,
+        // SQLITE_ERROR says it in words only.
+        Some(1) => no_table(error, "no such table: ").map_or(Case::Other, Case::NoTable),
         _ => Case::Other,
     }
 }
@@ -464,9 +495,19 @@ fn postgres_case(error: &sqlx::Error) -> Case {
             Some("53300") => Case::Unreachable,
             Some("3D000") => Case::NoDatabase,
             Some("28000" | "28P01") => Case::Login,
+            Some("42P01") => no_table(error, "relation ").map_or(Case::Other, Case::NoTable),
             _ => Case::Other,
         },
     }
+}
+
+/// The table that a database lacks, by what it says of it.
+fn no_table(error: &sqlx::Error, before: &str) -> Option<String> {
+    let said = error.as_database_error()?.message();
+    let (_, table) = said.split_once(before)?;
+    let table = table.split_whitespace().next()?.trim_matches('"');
+    // Tables may be told with their schema.
+    Some(table.rsplit('.').next().unwrap_or(table).to_owned())
 }
 
 /// SQLite's result code.
@@ -482,6 +523,17 @@ fn primary_code(error: &sqlx::Error) -> Option<u32> {
 /// PostgreSQL's five characters.
 fn sql_state(error: &sqlx::Error) -> Option<String> {
     Some(error.as_database_error()?.code()?.into_owned())
+}
+
+/// What to do about a table that is gone, where there is no copy of it.
+fn without_copy(table: &str) -> &'static str {
+    match table {
+        "volumes" | "_sqlx_migrations" => "take the acquisition in anew into another archive",
+        _ => {
+            "`saccade check --repair --acquisition FOLDER` makes the table anew, and `saccade ingest` takes in again what \
+             was in it, from the records and images that are still there"
+        }
+    }
 }
 
 /// Who holds a lock, behind "locked".

@@ -53,7 +53,16 @@ pub(super) async fn open(url: &str, create: bool) -> Result<PgPool, CatalogError
     let known = MIGRATOR.iter().map(|m| m.version).max().unwrap_or(0);
     let found = schema(&pool, &location, create).await?;
     match found.cmp(&known) {
-        Ordering::Equal => Ok(pool),
+        Ordering::Equal => {
+            let tables = "SELECT relname::text FROM pg_class WHERE relkind = 'r' \
+                          AND relnamespace = to_regnamespace(current_schema())";
+            let there: Vec<String> = sqlx::query_scalar(tables)
+                .fetch_all(&pool)
+                .await
+                .map_err(failed)?;
+            CatalogError::refuse_without(&there, &location)?;
+            Ok(pool)
+        }
         Ordering::Greater => Err(CatalogError::NewerSchema {
             found,
             known,

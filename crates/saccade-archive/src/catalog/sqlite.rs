@@ -192,6 +192,7 @@ async fn open_to_write(path: &Path) -> Result<Opened, CatalogError> {
     let options = options(path, access).create_if_missing(true);
     let writer = connect(writer, options, path).await?;
     migrate(&writer, path).await?;
+    refuse_without_tables(&writer, path).await?;
     let readers = open_readers(path, access).await?;
     Ok(Opened::new(path, access, Some(writer), readers))
 }
@@ -206,6 +207,7 @@ pub(super) async fn open_to_read(path: &Path) -> Result<Opened, CatalogError> {
     };
     let readers = open_readers(path, access).await?;
     refuse_other_schema(&readers, path).await?;
+    refuse_without_tables(&readers, path).await?;
     Ok(Opened::new(path, access, None, readers))
 }
 
@@ -249,6 +251,7 @@ async fn open_again(path: &Path) -> Result<Opened, CatalogError> {
     let access = Access::Write;
     let readers = open_readers(path, access).await?;
     refuse_other_schema(&readers, path).await?;
+    refuse_without_tables(&readers, path).await?;
     Ok(Opened::new(path, access, None, readers))
 }
 
@@ -313,6 +316,16 @@ fn refuse_foreign_file(path: &Path) -> Result<(), CatalogError> {
     } else {
         Ok(())
     }
+}
+
+/// Refuses what is no catalog.
+pub(super) async fn refuse_foreign(path: &Path) -> Result<(), CatalogError> {
+    refuse_foreign_file(path)?;
+    let failed = |e| CatalogError::sort(e, &path.into());
+    let options = options(path, Access::Write);
+    let mut connection = options.connect().await.map_err(failed)?;
+    refuse_foreign_database(&mut connection, path).await?;
+    connection.close().await.map_err(failed)
 }
 
 #[cfg(target_os = "linux")]
@@ -407,6 +420,16 @@ async fn refuse_other_schema(pool: &SqlitePool, path: &Path) -> Result<(), Catal
             location: path.into(),
         }),
     }
+}
+
+/// Of a file that was damaged, or that somebody has changed, tables may be gone; that is told before anything is done.
+async fn refuse_without_tables(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
+    let question = "SELECT name FROM sqlite_schema WHERE type = 'table'";
+    let there: Vec<String> = sqlx::query_scalar(question)
+        .fetch_all(pool)
+        .await
+        .map_err(|e| CatalogError::sort(e, &path.into()))?;
+    CatalogError::refuse_without(&there, &path.into())
 }
 
 async fn refuse_foreign_database(

@@ -59,6 +59,7 @@ on_both! {
     spoilt::what_is_queued_and_cannot_be_understood_is_set_aside,
     spoilt::what_a_tile_names_is_not_on_the_list_of_what_is_to_be_deleted,
     whose::another_archives_catalog_is_neither_read_nor_written,
+    whose::a_table_that_is_gone_is_named_with_the_way_out,
     workers::workers_share_what_is_to_be_done,
     workers::a_dead_workers_claims_return,
     workers::a_sign_of_life_keeps_claims,

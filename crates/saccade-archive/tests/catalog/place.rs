@@ -36,18 +36,24 @@ impl Place {
 
     /// Does what no program of ours does.
     pub(crate) async fn meddle(&self, statement: &str) {
+        self.try_meddle(statement).await.unwrap();
+    }
+
+    pub(crate) async fn try_meddle(&self, statement: &str) -> Result<(), sqlx::Error> {
         let statement = sqlx::AssertSqlSafe(statement.to_owned());
         match &self.location {
             CatalogLocation::File(path) => {
                 let pool = sqlx::SqlitePool::connect(path.to_str().unwrap()).await;
                 let pool = pool.unwrap();
-                sqlx::query(statement).execute(&pool).await.unwrap();
+                let done = sqlx::query(statement).execute(&pool).await;
                 pool.close().await;
+                done.map(drop)
             }
             CatalogLocation::Postgres(url) => {
                 let pool = sqlx::PgPool::connect(url).await.unwrap();
-                sqlx::query(statement).execute(&pool).await.unwrap();
+                let done = sqlx::query(statement).execute(&pool).await;
                 pool.close().await;
+                done.map(drop)
             }
         }
     }

@@ -6,10 +6,12 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::Args;
 use indicatif::ProgressBar;
-use saccade_archive::VisualizationArchive;
+use saccade_archive::catalog::{Catalog, CatalogError};
 use saccade_archive::check::{
     CheckOptions, CheckReport, Finding, FindingKind, Repair, check, count,
 };
+
+use saccade_archive::{ArchiveError, VisualizationArchive};
 
 use crate::arguments::Archive;
 use crate::report::{say, tell};
@@ -28,8 +30,8 @@ pub(crate) struct Check {
     quick: bool,
 
     /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume to where their
-    /// records say; give tiles that are damaged, or name another's pyramid, back to `saccade ingest`, or set them aside
-    /// if --acquisition does not help [default: change nothing]
+    /// records say; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back
+    /// to `saccade ingest`, or set them aside if --acquisition does not help [default: change nothing]
     #[arg(long)]
     repair: bool,
 
@@ -47,7 +49,19 @@ pub(crate) struct Check {
 impl Check {
     pub(crate) async fn run(self) -> Result<ExitCode> {
         let location = self.archive.location()?;
-        let archive = VisualizationArchive::open(&location).await?;
+        let (archive, made) = match VisualizationArchive::open(&location).await {
+            Err(ArchiveError::Catalog(CatalogError::NoTable { .. })) if self.repair => {
+                let made = Catalog::make_tables_anew(location.catalog()).await?;
+                for table in &made {
+                    say(&format!(
+                        "the catalog had no table {table:?}; made anew, empty: {}",
+                        location.catalog()
+                    ));
+                }
+                (VisualizationArchive::open(&location).await?, made.len())
+            }
+            archive => (archive?, 0),
+        };
         let options = CheckOptions {
             quick: self.quick,
             repair: self.repair,
@@ -73,7 +87,7 @@ impl Check {
             }
         }
         say(&format!("{}: {location}", summary(&report)));
-        Ok(if report.damage() > 0 {
+        Ok(if report.damage() > 0 || made > 0 {
             ExitCode::from(DAMAGE)
         } else {
             ExitCode::SUCCESS

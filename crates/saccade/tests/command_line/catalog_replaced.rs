@@ -1,4 +1,4 @@
-//! A server whose catalog is taken away, and another is put in its place.
+//! A server whose catalog is taken away, and another is put in its place; a catalog that lost a table.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use saccade_archive::catalog::Catalog;
 use saccade_core::volume::Volume;
 
 use super::answers::{Answer, Client};
-use super::{Running, archive, saccade};
+use super::{Running, archive, done, run, saccade, stderr};
 
 fn files(archive: &str) -> [PathBuf; 3] {
     let file = Path::new(archive).join(VisualizationArchive::CATALOG);
@@ -95,4 +95,60 @@ fn a_server_serves_nothing_of_another_archives_catalog_and_goes_on_with_the_righ
     }
     let after = client.until(status, |answer| answer.status == 200).json();
     assert_eq!(after["tiles"], before["tiles"]);
+}
+
+#[test]
+fn a_catalog_that_lost_its_table_of_tiles_is_named_and_made_anew_from_the_records() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let acquisition = folder.path().join("acquisition");
+    let acquisition = acquisition.to_str().unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let tiles = || {
+        runtime.block_on(async {
+            let catalog = Catalog::open(files(&archive)[0].as_path()).await.unwrap();
+            let tiles = catalog.entry("phantom").await.unwrap().tiles;
+            catalog.close().await;
+            tiles
+        })
+    };
+    let before = tiles();
+    runtime.block_on(async {
+        let path = format!("sqlite:{}", files(&archive)[0].display());
+        let pool = sqlx::SqlitePool::connect(&path).await.unwrap();
+        sqlx::query("DROP TABLE tiles")
+            .execute(&pool)
+            .await
+            .unwrap();
+        pool.close().await;
+    });
+    for command in [
+        &["ingest", acquisition, &archive, "--once", "--lossless"][..],
+        &["check", &archive],
+    ] {
+        let output = run(command);
+        let said = stderr(&output);
+        assert!(!output.status.success(), "{said}");
+        assert!(
+            said.contains("has no table \"tiles\"")
+                && said.contains("saccade check --repair --acquisition FOLDER")
+                && said.contains(&archive),
+            "{said}"
+        );
+    }
+    let repair = ["check", &archive, "--repair", "--acquisition", acquisition];
+    let output = run(repair);
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(3), "{said}");
+    assert!(
+        said.contains("made anew, empty") && said.contains(&format!("{before} lost")),
+        "{said}"
+    );
+    done(["ingest", acquisition, &archive, "--once", "--lossless"]);
+    assert_eq!(tiles(), before);
+    let checked = stderr(&done(["check", &archive, "--acquisition", acquisition]));
+    assert!(checked.contains("all whole"), "{checked}");
 }
