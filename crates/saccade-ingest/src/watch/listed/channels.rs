@@ -1,5 +1,7 @@
 //! Which channels the images of a list show.
 
+use std::collections::HashMap;
+
 use super::source::{Listing, Named};
 use super::{ListConfig, ListError};
 use crate::replay::lists::channel_names;
@@ -58,6 +60,28 @@ impl Listing {
             }
         });
         self.unfit = unfit;
+    }
+
+    /// Takes those that registration does not know along with another channel at the same place: one channel is registered,
+    /// and all were imaged at once.
+    pub(super) fn take_along(&mut self) {
+        let Some(own) = &mut self.own else {
+            return;
+        };
+        let place = |tile: &Named| (tile.section, tile.stage.elements().map(f64::to_bits));
+        let mut known = HashMap::new();
+        for tile in { self.tiles.iter() }.filter(|tile| tile.channel.is_some()) {
+            if let Some(transform) = own.transforms.get(&tile.known_as) {
+                known.entry(place(tile)).or_insert(*transform);
+            }
+        }
+        for tile in { self.tiles.iter() }.filter(|tile| tile.channel.is_some()) {
+            if let Some(transform) = known.get(&place(tile)) {
+                own.transforms
+                    .entry(tile.known_as.clone())
+                    .or_insert(*transform);
+            }
+        }
     }
 
     /// Whether any image is left.

@@ -132,6 +132,7 @@ pub(super) fn read(config: &ListConfig, channels: bool) -> Result<Listing, Acqui
     listing.tiles.sort_by_key(|tile| tile.section);
     if channels {
         listing.take_channels(config);
+        listing.take_along();
     }
     Ok(listing)
 }

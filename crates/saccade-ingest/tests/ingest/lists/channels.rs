@@ -8,7 +8,7 @@ use saccade_ingest::replay::{Input, detect};
 use saccade_ingest::watch::{ListConfig, Pattern};
 
 use super::{SIZE, Scope, config, roomy, write};
-use crate::scope::{VOLUME, archive};
+use crate::scope::{VOLUME, archive, seen};
 
 async fn channels(archive: &VisualizationArchive) -> BTreeMap<String, u32> {
     let mut all = BTreeMap::new();
@@ -108,6 +108,56 @@ async fn names_say_the_channel_and_the_order_of_the_list_theirs() {
         "{refused}"
     );
     assert_eq!(scope.records().len(), told);
+}
+
+/// Fiji registers one channel, and the others were imaged at the same places.
+#[tokio::test]
+async fn what_registration_does_not_know_goes_with_the_channel_that_it_knows() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let by_name = || ListConfig {
+        channel_in: Some(Pattern::of_channels("{}_{channel}.tif").unwrap()),
+        ..roomy(&list)
+    };
+    let lines = |places: &[(&str, f64, f64)]| {
+        let line = |(name, x, y): &(&str, f64, f64)| format!("{name}.tif; ; ({x}, {y})\n");
+        format!("dim = 2\n{}", places.iter().map(line).collect::<String>())
+    };
+    for (seed, name) in (1..).zip(["a_SE", "b_SE", "c_SE", "a_BSE", "b_BSE", "c_BSE"]) {
+        scope.image(name, seed);
+    }
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let all = [
+        ("a_SE", 0.0, 0.0),
+        ("a_BSE", 0.0, 0.0),
+        ("b_SE", 50.0, 0.0),
+        ("b_BSE", 50.0, 0.0),
+        ("c_SE", 100.0, 0.0),
+        // One that was not imaged with the others.
+        ("c_BSE", 101.0, 0.0),
+    ];
+    write(&list, lines(&all));
+    scope.once(by_name(), &archive).await;
+    let se = [
+        ("a_SE", 700.0, 9.0),
+        ("b_SE", 753.0, 11.0),
+        ("c_SE", 800.0, 9.0),
+    ];
+    write(&registered, lines(&se));
+    scope.once(by_name(), &archive).await;
+    let tiles = seen(&archive).await.into_iter();
+    let places = tiles.map(|(name, tile)| (name, [tile.transform[4], tile.transform[5]]));
+    let want = [
+        ("a_BSE", [0.0, 0.0]),
+        ("a_SE", [0.0, 0.0]),
+        ("b_BSE", [53.0, 2.0]),
+        ("b_SE", [53.0, 2.0]),
+        ("c_BSE", [101.0, 0.0]),
+        ("c_SE", [100.0, 0.0]),
+    ];
+    let want = want.map(|(name, place)| (name.to_owned(), place));
+    assert_eq!(places.collect::<Vec<_>>(), want);
 }
 
 /// Render's tiles name an image for each channel; a replay shows the same.
