@@ -138,6 +138,8 @@ fn listed(text: &str, line: u64) -> Result<ListedTile, String> {
 pub struct Images {
     folder: PathBuf,
     by_name: BTreeMap<String, PathBuf>,
+    /// Another of each name that several have.
+    others: BTreeMap<String, PathBuf>,
 }
 
 impl Images {
@@ -147,7 +149,7 @@ impl Images {
     ///
     /// [`AcquisitionError::Read`] for a folder that cannot be listed.
     pub fn below(folder: &Path) -> Result<Self, AcquisitionError> {
-        let mut by_name = BTreeMap::new();
+        let (mut by_name, mut others) = (BTreeMap::new(), BTreeMap::new());
         let mut open = vec![folder.to_owned()];
         while let Some(at) = open.pop() {
             let failed = |source| AcquisitionError::Read {
@@ -166,7 +168,9 @@ impl Images {
                         .entry(name.to_owned())
                         .or_insert_with(|| path.clone());
                     if path < *known {
-                        *known = path;
+                        others.insert(name.to_owned(), std::mem::replace(known, path));
+                    } else if path != *known {
+                        others.insert(name.to_owned(), path);
                     }
                 }
             }
@@ -174,7 +178,16 @@ impl Images {
         Ok(Self {
             folder: folder.to_owned(),
             by_name,
+            others,
         })
+    }
+
+    /// The image that [`Self::find`] takes for `file`, and another that may be meant as well, since several have its name and
+    /// none lies at that path.
+    pub fn several(&self, file: &str) -> Option<[&Path; 2]> {
+        let as_named = super::image_path(&self.folder, file).is_some_and(|path| path.is_file());
+        let name = file.rsplit(['/', '\\']).next().filter(|_| !as_named)?;
+        Some([self.by_name.get(name)?, self.others.get(name)?])
     }
 
     /// The image that a list calls `file`: at that path below the folder, else by name alone.
@@ -265,5 +278,10 @@ mod tests {
         assert_eq!(found("editme/a.tif").unwrap(), Path::new("deep/er/a.tif"));
         assert_eq!(found("C:\\scope\\b.tif").unwrap(), Path::new("b.tif"));
         assert_eq!(found("none.tif"), None);
+        let [taken, other] = images.several("editme/a.tif").unwrap();
+        assert!(taken.ends_with("deep/er/a.tif") && other.ends_with("other/a.tif"));
+        for clear in ["other/a.tif", "b.tif", "none.tif"] {
+            assert_eq!(images.several(clear), None, "{clear}");
+        }
     }
 }

@@ -76,6 +76,7 @@ impl Acquisition {
         let listed = lists::read(list)?;
         listed.say_notes();
         let images = Images::below(folder)?;
+        listed.say_several(&images, list);
         let named = solution.map(Solution::read).transpose()?;
         let solution = named.or_else(|| listed.solution.clone());
         Self::new(

@@ -216,6 +216,7 @@ fn find_acquisition(folder: &Path, tree: &Tree) -> Result<Option<Acquisition>, R
     match chosen(tree, &images)? {
         Some((list, listed, true)) => {
             listed.say_notes();
+            listed.say_several(&images, &list);
             with_solution(folder, tree, &images, &list, listed).map(Some)
         }
         // Says which images are missing.

@@ -123,6 +123,22 @@ impl List {
         self.channels.as_ref().unwrap_or(&self.tiles)
     }
 
+    /// Says which of several images of one name are taken.
+    pub(crate) fn say_several(&self, images: &Images, list: &Path) {
+        let mut several =
+            { self.of_all_channels().iter() }.filter_map(|tile| images.several(&tile.file));
+        if let Some([taken, other]) = several.next() {
+            let all = 1 + several.count();
+            log::warn!(
+                "the names of {all} images of the list are in several folders: taken is {}, for one, and not {}; name them with \
+                 their folders in the list: {}",
+                taken.display(),
+                other.display(),
+                list.display()
+            );
+        }
+    }
+
     /// Says what of it does not count.
     pub(crate) fn say_notes(&self) {
         for note in &self.notes {

@@ -239,6 +239,41 @@ fn lines_that_name_an_image_again_are_told() {
     }
 }
 
+/// A replay does not wait for whoever could say which one is meant.
+#[test]
+fn which_of_several_images_is_replayed_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, out] = ["scope", "out"].map(|name| folder.path().join(name));
+    for name in ["one/a.png", "two/a.png", "b.png"] {
+        std::fs::create_dir_all(scope.join(name).parent().unwrap()).unwrap();
+        picture(&scope, name, 10);
+    }
+    let list = scope.join("list.txt");
+    let replay = [
+        "simulate",
+        text(&out),
+        "--input",
+        text(&scope),
+        "--rate",
+        "max",
+    ];
+    std::fs::write(&list, "two/a.png 0 0 0\nb.png 35 0 0\n").unwrap();
+    assert!(!stderr(&done(replay)).contains("several folders"));
+    std::fs::remove_dir_all(&out).unwrap();
+    std::fs::write(&list, "a.png 0 0 0\nb.png 35 0 0\n").unwrap();
+    let said = stderr(&done(replay));
+    let told = [
+        "the names of 1 images",
+        "several folders",
+        "one/a.png",
+        "two/a.png",
+        "list.txt",
+    ];
+    for words in told {
+        assert!(said.contains(words), "{said}");
+    }
+}
+
 /// Those who look from elsewhere are told what it waits for, as long as it does.
 #[test]
 fn what_a_list_waits_for_is_in_its_status() {
