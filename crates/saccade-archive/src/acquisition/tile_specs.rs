@@ -340,7 +340,7 @@ mod tests {
         assert_eq!(tile.file, "/scope/a.b/c.tif");
         let none = channel("", "only");
         assert_eq!(read(&[]).unwrap()[0].channels, []);
-        assert_eq!(read(&[none.clone()]).unwrap()[0].channels, []);
+        assert_eq!(read(std::slice::from_ref(&none)).unwrap()[0].channels, []);
         for (bad, why) in [
             (vec![named("a"), none], "no name"),
             (vec![named("a"), named("a")], "are called \"a\""),
