@@ -239,6 +239,54 @@ fn lines_that_name_an_image_again_are_told() {
     }
 }
 
+/// It may be about others of such names, or be saved too early.
+#[test]
+fn a_project_of_some_of_the_tiles_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    for name in ["a.png", "b.png", "c.png"] {
+        picture(&scope, name, 10);
+    }
+    let list = scope.join("list.txt");
+    let ingest = [
+        "ingest",
+        text(&scope),
+        text(&archive),
+        "--once",
+        "--voxel",
+        "4",
+    ];
+    let project = |names: &[&str]| {
+        let patch = |(n, name): (usize, &&str)| {
+            format!(
+                r#"<t2_patch width="40" height="30" transform="matrix(1,0.01,0,1,{},5)" file_path="{name}.png"/>"#,
+                n * 36
+            )
+        };
+        let patches: String = names.iter().enumerate().map(patch).collect();
+        let text = format!(r#"<trakem2><t2_layer z="0">{patches}</t2_layer></trakem2>"#);
+        std::fs::write(scope.join("project.xml"), text).unwrap();
+    };
+    std::fs::write(&list, "a.png 0 0 0\nb.png 35 0 0\nc.png 70 0 0\n").unwrap();
+    project(&["a", "b", "x"]);
+    let said = stderr(&done(ingest));
+    let told = [
+        "knows 2 of the 3 tiles, and is not used",
+        "\"c\"",
+        "project.xml",
+    ];
+    for words in told {
+        assert_eq!(said.matches(words).count(), 1, "{said}");
+    }
+    project(&["a", "b", "c"]);
+    let said = stderr(&done(ingest));
+    assert!(
+        !said.contains("is not used") && said.contains("3 moved"),
+        "{said}"
+    );
+}
+
 /// A replay does not wait for whoever could say which one is meant.
 #[test]
 fn which_of_several_images_is_replayed_is_told() {

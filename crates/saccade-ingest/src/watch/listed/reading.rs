@@ -123,7 +123,7 @@ impl<F: Folders> ListWatch<F> {
             self.keep_counted(&listing, counted)?;
         }
         self.say_shift();
-        self.say_unsolved(&listing);
+        self.say_unsolved(&listing, &projects);
         self.files.are_read();
         self.enter(listing, now);
         Ok(false)
@@ -191,10 +191,11 @@ impl<F: Folders> ListWatch<F> {
     }
 
     /// Says how many tiles registration does not know, when that changes, or why what it found is not used.
-    fn say_unsolved(&mut self, listing: &Listing) {
+    fn say_unsolved(&mut self, listing: &Listing, projects: &[PathBuf]) {
         let Some(adopted) = &self.adopted else {
             if !self.unused_said
-                && let Some(why) = source::unused(listing)
+                && let Some(why) =
+                    source::unused(listing).or_else(|| source::unused_project(listing, projects))
             {
                 log::warn!("{why}");
                 self.unused_said = true;

@@ -221,12 +221,7 @@ pub(super) fn adopt(
         return Ok(None);
     }
     let mut solutions = Vec::from_iter(listing.own.clone());
-    let small = |path: &&PathBuf| {
-        let meta = path.metadata();
-        meta.is_ok_and(|meta| meta.is_file() && meta.len() <= LARGEST_LIST)
-            && refuse_link_out(path).is_ok()
-    };
-    for project in projects.iter().filter(small).filter(|p| is_project(p)) {
+    for project in readable(projects) {
         solutions.push(Solution::read(project)?);
     }
     let Some(solution) = best(&wanted, &raw, solutions, listing.own.as_ref()) else {
@@ -234,6 +229,38 @@ pub(super) fn adopt(
     };
     let offset = offset(&solution, raw).unwrap_or_default();
     Ok(Some(Adopted { solution, offset }))
+}
+
+/// Those that are projects of TrakEM2.
+fn readable(projects: &[PathBuf]) -> impl Iterator<Item = &PathBuf> {
+    let small = |path: &&PathBuf| {
+        let meta = path.metadata();
+        meta.is_ok_and(|meta| meta.is_file() && meta.len() <= LARGEST_LIST)
+            && refuse_link_out(path).is_ok()
+    };
+    projects
+        .iter()
+        .filter(small)
+        .filter(|path| is_project(path))
+}
+
+/// Why a project that knows some of the tiles is not used.
+pub(super) fn unused_project(listing: &Listing, projects: &[PathBuf]) -> Option<String> {
+    let wanted: BTreeSet<&str> = listing.tiles.iter().map(|t| &*t.known_as).collect();
+    readable(projects).find_map(|project| {
+        let solution = Solution::read(project).ok()?;
+        let knows = |name: &&&str| solution.transforms.contains_key(**name);
+        let known = wanted.iter().filter(knows).count();
+        let first = wanted.iter().find(|name| !knows(name))?;
+        (known > 0).then(|| {
+            format!(
+                "a TrakEM2 project knows {known} of the {} tiles, and is not used, since it does not know the others, such as \
+                 {first:?}: {}",
+                wanted.len(),
+                project.display()
+            )
+        })
+    })
 }
 
 /// Why what the list's own program found is not used, where that is not plain to see.
