@@ -392,6 +392,15 @@ mod tests {
             assert!(stage.is_finite() && solved.is_finite());
             assert_eq!(tile.left_out, ["NonLinearCoordinateTransform"]);
         }
+        // Of array tomography, with an image for each channel.
+        let tiles = read("multichan_intensity_correction_template.json").unwrap();
+        assert_eq!(tiles.len(), 8);
+        for tile in &tiles {
+            let names: Vec<_> = tile.channels.iter().map(|image| &*image.name).collect();
+            assert_eq!(names, ["PSD95", "DAPI_1"], "{}", tile.id);
+            assert_eq!(tile.file, tile.channels[1].file);
+            assert!(tile.channels[0].stem().starts_with("PSD95_S0000_F000"));
+        }
         let refused = read("fusion_test_tilespecs_ref.json").unwrap_err();
         assert!(
             refused.to_string().contains("PolynomialTransform2D"),
