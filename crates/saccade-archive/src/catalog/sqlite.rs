@@ -578,10 +578,7 @@ mod tests {
 
         // Taken away in the middle of a transaction.
         let mut commit = catalog.begin("v").await.unwrap();
-        commit
-            .tile(&tile("c"), std::time::SystemTime::now())
-            .await
-            .unwrap();
+        commit.tile(&tile("c"), SystemTime::now()).await.unwrap();
         std::fs::remove_file(&path).unwrap();
         let refused = commit.finish().await.unwrap_err();
         assert!(moved(&refused), "{refused}");

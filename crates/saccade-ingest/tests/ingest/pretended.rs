@@ -151,7 +151,11 @@ async fn what_a_dead_worker_had_claimed_is_taken_up_when_its_lease_of_a_day_is_o
     assert_eq!(catalog.claim(VOLUME, &dead, 9).await.unwrap().len(), 2);
     let end = clock.now() + dead.lease();
 
-    let ingest = started(&scope, &archive, patient(), &Cancel::new());
+    let options = IngestOptions {
+        poll: HOUR,
+        ..patient()
+    };
+    let ingest = started(&scope, &archive, options, &Cancel::new());
     turn_to(&clock, end - MINUTE).await;
     assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, 0, "it may live");
     assert!(!ingest.is_finished());
