@@ -13,16 +13,65 @@
 // alone decide an `if` or end a loop; what is combined with this does not.
 var<private> nothing: u32;
 
+// What the frame says of all rays alike. Read once, before they part: where some rays may not be drawn along, drivers
+// that draw on the CPU read a uniform for each ray anew.
+struct Steady {
+    flags: u32,
+    level_count: u32,
+    block_edge_log2: u32,
+    depth: u32,
+    directory_entries: u32,
+    bricks: u32,        // slots of the brick cache
+    brick_grid: vec3f,  // the same per axis
+    largest: f32,
+    octree_slots: u32,
+    octree_eye: vec3f,
+    octree_anchor: vec3i,
+    cells_per_nm: vec3f,
+    last_cell: vec3i,
+}
+
+var<private> steady: Steady;
+// The channel that is seen, if one is.
+var<private> only: Channel;
+
+fn read_steady() {
+    let grid = frame.brick_grid;
+    steady = Steady(
+        frame.flags | nothing,
+        frame.level_count | nothing,
+        frame.block_edge_log2,
+        frame.depth,
+        frame.directory_entries,
+        grid.x * grid.y * grid.z,
+        vec3f(grid),
+        frame.largest,
+        frame.octree.slots,
+        frame.octree.eye,
+        frame.octree.anchor,
+        frame.octree.cells_per_nm,
+        vec3i(frame.octree.cells) - 1,
+    );
+    only = frame.channels[0];
+}
+
+fn channel_of(channel: u32) -> Channel {
+    if SLOTS == 1u {
+        return only;
+    }
+    return frame.channels[channel];
+}
+
 fn has_flag(flag: u32) -> bool {
-    return ((frame.flags | nothing) & flag) != 0u;
+    return (steady.flags & flag) != 0u;
 }
 
 fn channel_has(channel: u32, flag: u32) -> bool {
-    return ((frame.channels[channel].flags | nothing) & flag) != 0u;
+    return ((channel_of(channel).flags | nothing) & flag) != 0u;
 }
 
 fn level_count() -> u32 {
-    return frame.level_count | nothing;
+    return steady.level_count;
 }
 
 // Where the way to a brick ended.
@@ -61,8 +110,7 @@ fn mark_brick_used(slot: u32) {
 }
 
 fn mark_block_used(block: u32) {
-    let bricks = frame.brick_grid.x * frame.brick_grid.y * frame.brick_grid.z;
-    mark_used(bricks + block);
+    mark_used(steady.bricks + block);
 }
 
 // Reports an entry once a frame. A small `urgency` is urgent.
@@ -93,7 +141,7 @@ fn found_at(value: u32, physical: u32, span_log2: u32) -> Found {
 
 // `base` is the level's first entry of the channel in the page directory, which has `size` of them per axis.
 fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found {
-    let edge = frame.block_edge_log2;
+    let edge = steady.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
     let block_at = brick >> vec3u(edge);
     let is_last = level + 1u == last[channel].level && all(block_at == last[channel].at);
@@ -101,7 +149,7 @@ fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found
     var value = last[channel].block;
     var physical = 0u;
     if !is_last {
-        span = edge * (frame.depth - 1u);
+        span = edge * (steady.depth - 1u);
         let cell = brick >> vec3u(span);
         physical = base + (cell.z * size.y + cell.y) * size.x + cell.x;
         value = directory[physical];
@@ -120,7 +168,7 @@ fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found
             span -= edge;
             let at = (brick >> vec3u(span)) & inside;
             let entry = (block << (3u * edge)) + ((((at.z << edge) + at.y) << edge) + at.x);
-            physical = frame.directory_entries + entry;
+            physical = steady.directory_entries + entry;
             value = tables[entry];
         lookups += 1u;
             continuing {

@@ -40,7 +40,7 @@ var<private> nodes_visited: u32;
 
 // The level of a channel that is drawn where `level` is wanted.
 fn channel_level(channel: u32, level: u32) -> u32 {
-    let here = frame.channels[channel];
+    let here = channel_of(channel);
     return clamp(level + here.coarser, here.first_level, here.last_level);
 }
 
@@ -61,10 +61,9 @@ fn lowest_of(channels: u32) -> u32 {
 
 // The cell of the volume nearest to a place on a ray.
 fn cell_at(depth: f32, ray: vec3f) -> vec3u {
-    let at = frame.octree.eye + depth * ray * frame.octree.cells_per_nm;
+    let at = steady.octree_eye + depth * ray * steady.cells_per_nm;
     let steps = clamp(floor(at), vec3f(-1e9), vec3f(1e9));
-    let last = vec3i(frame.octree.cells) - 1;
-    return vec3u(clamp(frame.octree.anchor + vec3i(steps), vec3i(0), last));
+    return vec3u(clamp(steady.octree_anchor + vec3i(steps), vec3i(0), steady.last_cell));
 }
 
 // A number per axis, from a byte each.
@@ -81,26 +80,26 @@ fn child_index(cell: vec3u, depth: u32) -> u32 {
 // Depth at which a ray leaves the node of some depth that a cell is in.
 fn leaving_node(cell: vec3u, depth: u32, ray: vec3f) -> f32 {
     let shift = axes(frame.octree.depths[depth].shift);
-    let first = vec3i((cell >> shift) << shift) - frame.octree.anchor;
+    let first = vec3i((cell >> shift) << shift) - steady.octree_anchor;
     let low = vec3f(first);
     let high = low + vec3f(vec3u(1u) << shift);
-    return leaving_depth(low, high, frame.octree.eye, ray * frame.octree.cells_per_nm);
+    return leaving_depth(low, high, steady.octree_eye, ray * steady.cells_per_nm);
 }
 
 // Where a stored value, as an integer, is in the colour table [entries].
 fn table_position(channel: u32, value: f32) -> f32 {
-    let here = frame.channels[channel];
+    let here = channel_of(channel);
     return clamp(value * here.table_scale + here.table_offset, 0.0, f32(TABLE_LEN - 1u));
 }
 
 // Whether no value between two stored values, ends included, is visible.
 fn is_range_hidden(channel: u32, low: u32, high: u32) -> bool {
     if MODE == MODE_MAXIMUM {
-        return f32(high) <= largest_seen[channel] * frame.largest;
+        return f32(high) <= largest_seen[channel] * steady.largest;
     }
     let first = floor(table_position(channel, f32(low)));
     let last = ceil(table_position(channel, f32(high)));
-    let here = frame.channels[channel];
+    let here = channel_of(channel);
     return high == 0u || last < here.first_opaque || first > here.last_opaque;
 }
 
@@ -114,7 +113,7 @@ fn popped(path: Path) -> Path {
 
 // What a node knows of a channel: NODE_BINS, NODE_RANGE, NODE_VALID and NODE_CHILDREN.
 fn node_texel(node: u32, channel: u32) -> vec4u {
-    let texel = node * frame.octree.slots + frame.channels[channel].octree_slot;
+    let texel = node * steady.octree_slots + channel_of(channel).octree_slot;
     return textureLoad(nodes, vec2u(texel % NODE_ROW, texel / NODE_ROW), 0);
 }
 
@@ -185,13 +184,13 @@ fn region_at(level: u32, deepest: u32, depth: f32, ray: vec3f) -> Region {
                 let low = range & 0xffffu;
                 let high = range >> 16u;
                 let bins = known[NODE_BINS];
-                let visible = countOneBits(bins & frame.channels[c].visible_bins);
+                let visible = countOneBits(bins & channel_of(c).visible_bins);
                 if visible == 0u || is_range_hidden(c, low, high) {
                     hidden |= bit;
                 } else if low == high {
                     alike |= bit;
                     settled |= bit;
-                    uniform_stored[c] = f32(low) / frame.largest;
+                    uniform_stored[c] = f32(low) / steady.largest;
                 } else if visible * 4u > countOneBits(bins) * 3u {
                     // Where nearly all is seen, a closer look finds little to skip.
                     settled |= bit;
@@ -240,7 +239,7 @@ fn levels_around(channel: u32, cell: vec3u) -> u32 {
     loop {
         nodes_visited += 1u;
         let known = node_texel(node, channel);
-        let resident = residents[node * frame.octree.slots + frame.channels[channel].octree_slot];
+        let resident = residents[node * steady.octree_slots + channel_of(channel).octree_slot];
         levels |= known[NODE_VALID];
         let children = known[NODE_CHILDREN];
         if children == 0u || at + 1u >= MOST_DEPTHS {

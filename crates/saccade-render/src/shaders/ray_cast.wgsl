@@ -12,6 +12,10 @@
 @group(0) @binding(8) var bricks_sampler: sampler;
 @group(0) @binding(9) var image: texture_storage_2d<rgba8unorm, write>;
 
+const LOG2_E = 1.4426950408889634;
+// Segments of a row of bricks, of the first and of the others.
+const FIRST_ROW = 32u;
+const ROW = 64u;
 // Light that is left when a ray ends: less than one step of the picture even on white.
 const TERMINATION = 0.000244140625;
 // After so many segments a ray's steps double, and again after as many: all rays end.
@@ -87,12 +91,12 @@ fn is_transparent(channel: u32, slot: u32) -> bool {
 
 // Linear RGB and extinction of a stored value. Nothing acquired is nothing seen.
 fn color_of(channel: u32, stored: f32) -> vec4f {
-    let x = table_position(channel, stored * frame.largest);
+    let x = table_position(channel, stored * steady.largest);
     let i = min(u32(x), TABLE_LEN - 2u);
     let low = textureLoad(colors, vec2u(i, channel), 0);
     let high = textureLoad(colors, vec2u(i + 1u, channel), 0);
     let color = mix(low, high, x - f32(i));
-    return select(vec4f(0.0), color, stored > 0.0);
+    return vec4f(color.rgb, select(0.0, color.a, stored > 0.0));
 }
 
 // In false colours, how far the level that is drawn lies from the one that is wanted, or which it is.
@@ -119,7 +123,7 @@ struct Source {
 
 fn source(channel: u32, grid: Grid, depth: f32) -> Source {
     let place = place_of(grid, depth);
-    let entry = frame.channels[channel].directory_offset + grid.directory_base;
+    let entry = channel_of(channel).directory_offset + grid.directory_base;
     let found = find(channel, grid.level, place.brick, entry, grid.directory);
     return Source(grid.level, found, grid.eye - place.low, grid.voxels, leaving(grid, place, found.span_log2));
 }
@@ -158,7 +162,7 @@ var<private> first_texel: array<vec3f, SLOTS>;
 var<private> texels_per_depth: array<vec3f, SLOTS>;
 var<private> low_texel: array<vec3f, SLOTS>;
 var<private> texel: vec3f;
-// The same of the bricks after it, where one channel is seen, and with which samples they begin.
+// The same of the bricks after it, where one channel is seen, and with which samples of the row they begin.
 var<private> next_texel: array<vec3f, 2>;
 var<private> next_low: array<vec3f, 2>;
 var<private> turns: vec2f;
@@ -208,8 +212,8 @@ fn look_further(channel: u32, depth: f32, ray: vec3f, urgency: f32) {
         mark_missed(wanted.found, urgency);
     }
     let widens = wanted.found.entry == EMPTY && !wanted.found.stale;
-    let first_level = frame.channels[channel].first_level;
-    let coarsest = frame.channels[channel].last_level;
+    let first_level = channel_of(channel).first_level;
+    let coarsest = channel_of(channel).last_level;
     let preview = min(wanted.level + PREVIEW_LEVELS, coarsest);
     var coarser = 0u;
     var finer = 0u;
@@ -259,7 +263,7 @@ fn look_further(channel: u32, depth: f32, ray: vec3f, urgency: f32) {
 fn corner_of(channel: u32) -> vec3f {
     let here = drawn[channel];
     // Whole numbers below 2^22: exact, and quicker than dividing integers.
-    let grid = vec3f(frame.brick_grid);
+    let grid = steady.brick_grid;
     let slot = f32(here.found.entry - FIRST_SLOT) + 0.5;
     let row = floor(slot / grid.x);
     let layer = floor(slot / (grid.x * grid.y));
@@ -336,18 +340,28 @@ fn joined(texel: vec3i) -> f32 {
     return dot(textureLoad(bricks, texel, 0).rg, frame.combine);
 }
 
-// A place in a channel's brick, so far ahead of the first sample.
-fn in_brick(channel: u32, ahead: f32) -> vec3f {
-    let at = first_texel[channel] + ahead * texels_per_depth[channel];
+// A place in a channel's brick: of a sample, by its number in the row of bricks, so far ahead of the first.
+fn in_brick(channel: u32, number: f32, ahead: f32) -> vec3f {
+    var first = first_texel[channel];
+    var low = low_texel[channel];
+    if SLOTS == 1u {
+        first = select(first, next_texel[0], number >= turns.x);
+        first = select(first, next_texel[1], number >= turns.y);
+        if BOUNDED {
+            low = select(low, next_low[0], number >= turns.x);
+            low = select(low, next_low[1], number >= turns.y);
+        }
+    }
+    let at = first + ahead * texels_per_depth[channel];
     if BOUNDED {
-        return clamp(at, low_texel[channel], low_texel[channel] + f32(BRICK_EDGE) * texel);
+        return clamp(at, low, low + f32(BRICK_EDGE) * texel);
     }
     return at;
 }
 
-// Takes a sample of a channel, so far ahead of the first. Linear RGB and extinction of it, or what the mode keeps of it.
-fn sampled_at(channel: u32, ahead: f32, step: f32) -> vec4f {
-    let stored = stored_at(in_brick(channel, ahead));
+// Takes a sample of a channel, by its number in the row of bricks, so far ahead of the first. Linear RGB and extinction of it, or what the mode keeps of it.
+fn sampled_at(channel: u32, number: f32, ahead: f32, step: f32) -> vec4f {
+    let stored = stored_at(in_brick(channel, number, ahead));
     if MODE == MODE_EMISSION_ABSORPTION {
         let color = color_of(channel, stored);
         return vec4f(false_color(color.rgb, drawn[channel].level, drawn_for[channel]), color.a);
@@ -358,7 +372,7 @@ fn sampled_at(channel: u32, ahead: f32, step: f32) -> vec4f {
         }
         largest_seen[channel] = max(largest_seen[channel], stored);
     } else {
-        let iso = frame.channels[channel].iso;
+        let iso = channel_of(channel).iso;
         let before = sample_before[channel];
         sample_before[channel] = stored;
         if stored >= iso {
@@ -370,7 +384,7 @@ fn sampled_at(channel: u32, ahead: f32, step: f32) -> vec4f {
                 surface = channel;
                 surface_level = drawn[channel].level;
                 surface_wanted = drawn_for[channel];
-                surface_at = in_brick(channel, at);
+                surface_at = in_brick(channel, number, at);
             }
         }
     }
@@ -392,7 +406,7 @@ fn lit_surface(ray: vec3f) -> vec3f {
     let facing = abs(dot(gradient, ray)) / max(length(gradient) * length(ray), 1e-30);
     // Where values do not change there is no surface to light: as if it faced the eye.
     let diffuse = select(facing, 1.0, length(gradient) <= 1e-30);
-    let color = color_of(surface, frame.channels[surface].iso).rgb;
+    let color = color_of(surface, channel_of(surface).iso).rgb;
     return false_color(color, surface_level, surface_wanted) * (0.15 + 0.85 * diffuse);
 }
 
@@ -407,7 +421,8 @@ fn nothing_before(channels: u32) {
     }
 }
 
-fn trace(pixel: vec2u) -> vec3f {
+// The light of a pixel's ray. One that is not `inside` the picture has none, but sets out together with the others.
+fn trace(pixel: vec2u, inside: bool) -> vec3f {
     let from_middle = (vec2f(pixel) + 0.5) / vec2f(frame.size) * 2.0 - 1.0;
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
     let nm_per_depth = length(ray);
@@ -418,12 +433,12 @@ fn trace(pixel: vec2u) -> vec3f {
     let urgency = 1.0 + dot(from_middle, from_middle);
     let sample_at = select(0.5, pixel_noise(pixel), has_flag(FLAG_JITTER));
     let everything = all_channels();
-    texel = select(1.0 / vec3f(frame.brick_grid * BRICK_STORED_EDGE), vec3f(1.0), JOINED);
+    texel = select(1.0 / (steady.brick_grid * f32(BRICK_STORED_EDGE)), vec3f(1.0), JOINED);
 
     var light = vec3f(0.0);
     var transmitted = 1.0;
-    // What was transmitted when the last row of bricks began; so much that the first row is one brick.
-    var row_light = 1.0 / TERMINATION;
+    // What was transmitted when the last row of bricks began; more than can be where none did.
+    var row_light = 2.0;
     var start = depths.x;
     var level = 0u;
     var level_end = -1.0;
@@ -439,7 +454,7 @@ fn trace(pixel: vec2u) -> vec3f {
         largest_seen[c] = 0.0;
         sample_before[c] = 0.0;
     }
-    rays = select(0u, 1u, start < depths.y && level_count() > 0u);
+    rays = select(0u, 1u, inside && start < depths.y && level_count() > 0u);
     var going = rays > 0u;
     while going {
         var depth = start;
@@ -529,12 +544,14 @@ fn trace(pixel: vec2u) -> vec3f {
                     var sampled = 0u;
                     var forgets = false;
                     if SLOTS == 1u {
-                        // Several bricks in a row: rays that are drawn at once wait for each other at its end, and no
-                        // longer at the end of each brick. Surfaces end rays too soon for that, and what is behind
-                        // the end of a ray need not be looked up: a ray that would end if each of the next three bricks took
-                        // as much light as the last row did goes on brick by brick, as its first does.
-                        let taken = transmitted / row_light;
-                        let goes_on = transmitted * taken * taken * taken > TERMINATION;
+                        // Several bricks in a row, which ends after as many segments for all rays that are drawn at once: they wait for each
+                        // other there, and not at the end of each brick. Surfaces end rays too soon for that, and what is
+                        // behind the end of a ray need not be looked up: the first row is short, and a ray that would end
+                        // if the next took as much light as the last did goes on brick by brick.
+                        let is_first = row_light > 1.0;
+                        let row = select(ROW, FIRST_ROW, is_first);
+                        let taken = select(transmitted / row_light, 1.0, is_first);
+                        let goes_on = transmitted * taken > TERMINATION;
                         row_light = transmitted;
                         let most_bricks = select(1u, 3u, goes_on && MODE != MODE_ISO_SURFACE);
                         let wanted = grid.level;
@@ -566,6 +583,10 @@ fn trace(pixel: vec2u) -> vec3f {
                             aim_in_row(index, f32(count), depth);
                             sampled = 1u;
                             count += segments_until(min(min(most, around), drawn[0].leaving), next, step);
+                            if count >= row {
+                                count = row;
+                                break;
+                            }
                             let end = start + f32(count) * step;
                             let last = end + sample_at * min(step, depths.y - end);
                             if index + 1u >= most_bricks || drawn[0].level != wanted || end >= stretch || last >= around || segments + count >= doubling {
@@ -605,6 +626,10 @@ fn trace(pixel: vec2u) -> vec3f {
                     if lost != 0u {
                         break;
                     }
+                    // The last segment of a ray is cut where it leaves the volume: a row of its own, so that all segments of a
+                    // row are alike.
+                    count = min(count, max(u32((depths.y - start) / step), 1u));
+                    let halvings = -LOG2_E * first * nm_per_depth;
                     nothing_before(everything & ~sampled);
                     var rest = visible;
                     for (var n = count_of(visible); n > 0u; n -= 1u) {
@@ -621,50 +646,40 @@ fn trace(pixel: vec2u) -> vec3f {
                             aim(c, depth);
                         }
                     }
-                    var left = select(0u, count, sampled != 0u);
-                    samples += left * countOneBits(sampled);
+                    let end = f32(count);
                     var i = 0.0;
-                    if left > 0u {
+                    if sampled != 0u {
                         loop {
-                            let segment = min(step, depths.y - start - i * step);
-                            let ahead = i * step + sample_at * (segment - first);
+                            let ahead = i * step;
                             var sum = vec4f(0.0);
                             hit_at = 3e38;
                             if SLOTS == 1u {
-                                sum = sampled_at(0u, ahead, step);
+                                sum = sampled_at(0u, i, ahead, step);
                             } else {
                                 var rest = sampled;
                                 for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
-                                    let color = sampled_at(firstTrailingBit(rest), ahead, step);
+                                    let color = sampled_at(firstTrailingBit(rest), i, ahead, step);
                                     rest &= rest - 1u;
                                     sum += vec4f(color.a * color.rgb, color.a);
                                 }
                             }
                             if MODE == MODE_EMISSION_ABSORPTION {
-                                let opacity = opacity_of_length(sum.a, max(segment, 0.0) * nm_per_depth);
+                                let through = transmitted * exp2(sum.a * halvings);
                                 let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
-                                light += transmitted * opacity * share * sum.rgb;
-                                transmitted *= 1.0 - opacity;
+                                light += (transmitted - through) * share * sum.rgb;
+                                transmitted = through;
                             }
                             if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
                                 surface_light = transmitted;
                                 transmitted = 0.0;
                             }
                             i += 1.0;
-                            left -= 1u;
-                            if SLOTS == 1u && i >= turns.x {
-                                first_texel[0] = next_texel[0];
-                                if BOUNDED { low_texel[0] = next_low[0]; }
-                                next_texel[0] = next_texel[1];
-                                if BOUNDED { next_low[0] = next_low[1]; }
-                                turns = vec2f(turns.y, 3e38);
-                            }
                             continuing {
-                                break if left == 0u || transmitted <= TERMINATION;
+                                break if i >= end || transmitted <= TERMINATION;
                             }
                         }
                     }
-                    samples -= left * countOneBits(sampled);
+                    samples += u32(i) * countOneBits(sampled);
                     if FALSE_COLORS == FALSE_RESIDENCY && (missing & ~hidden) != 0u {
                         // A thin magenta fog: half the light is gone after 64 voxels.
                         let voxels = f32(count) * step * voxels_per_depth;
@@ -697,7 +712,7 @@ fn trace(pixel: vec2u) -> vec3f {
         for (var c = 0u; c < channel_count(); c += 1u) {
             let bit = 1u << c;
             if (lost & bit) != 0u {
-                look_further(c, depth, ray, depth * urgency * f32(1u + frame.channels[c].coarser));
+                look_further(c, depth, ray, depth * urgency * f32(1u + channel_of(c).coarser));
                 found |= bit;
             }
         }
@@ -752,9 +767,12 @@ fn main(
         ((local >> 2u) & 1u) | ((local >> 3u) & 6u),
     );
     nothing = group.x >> 31u;
+    read_steady();
     let pixel = group.xy * WORKGROUP + within + vec2u(0u, frame.first_row);
-    if all(pixel < frame.size) {
-        let color = heat_of(trace(pixel));
+    let inside = all(pixel < frame.size);
+    let traced = trace(pixel, inside);
+    if inside {
+        let color = heat_of(traced);
         textureStore(image, pixel, vec4f(srgb_from_linear(color), 1.0));
         atomicAdd(&tallies[COUNT_SAMPLES], samples);
         atomicAdd(&tallies[COUNT_LOOKUPS], lookups);
