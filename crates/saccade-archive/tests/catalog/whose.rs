@@ -120,7 +120,7 @@ pub(crate) async fn a_table_that_is_gone_is_named_with_the_way_out(place: &Place
     // As it was but for what was in it.
     for gone in [
         &["tiles"][..],
-        &["changes", "sections", "waiting", "archive", "held_up"],
+        &["archive", "changes", "held_up", "sections", "waiting"],
     ] {
         for table in gone {
             place.meddle(&format!("DROP TABLE IF EXISTS {table}")).await;
