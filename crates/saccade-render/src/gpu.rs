@@ -4,6 +4,7 @@ use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
+use crate::layout::Counting;
 use crate::ray_caster::RayCaster;
 
 /// A device and its queue, with error and loss handlers installed. Cloning shares them.
@@ -167,8 +168,19 @@ impl Gpu {
 
     pub(crate) fn ray_caster(&self) -> &RayCaster {
         // Where the processor draws, another thread that compiles would slow down frames, which take long anyway.
-        let in_background = self.adapter.device_type != wgpu::DeviceType::Cpu;
-        let new = || RayCaster::new(&self.device, in_background);
+        let is_processor = self.adapter.device_type == wgpu::DeviceType::Cpu;
+        let counting = match is_processor {
+            true => Counting::ByRays,
+            false => Counting::ByGroups,
+        };
+        let new = || RayCaster::new(&self.device, !is_processor, counting);
         self.ray_caster.get_or_init(new)
+    }
+
+    /// Counts as another kind of device would; before the first renderer.
+    #[cfg(test)]
+    pub(crate) fn count(&self, counting: Counting) {
+        let new = RayCaster::new(&self.device, false, counting);
+        self.ray_caster.set(new).expect("nothing was drawn yet");
     }
 }

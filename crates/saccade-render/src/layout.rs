@@ -262,8 +262,26 @@ impl Variant {
     }
 }
 
+/// How what rays did is counted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Counting {
+    /// For the rays of a workgroup together, which wait for each other.
+    ByGroups,
+    /// For each ray alone: quicker where a processor draws.
+    ByRays,
+}
+
+impl Counting {
+    const fn source(self) -> &'static str {
+        match self {
+            Self::ByGroups => include_str!("shaders/counting/by_groups.wgsl"),
+            Self::ByRays => include_str!("shaders/counting/by_rays.wgsl"),
+        }
+    }
+}
+
 /// The ray-caster's source.
-pub(crate) fn ray_cast(variant: Variant) -> String {
+pub(crate) fn ray_cast(variant: Variant, counting: Counting) -> String {
     let Variant {
         slots,
         mode,
@@ -279,11 +297,12 @@ pub(crate) fn ray_cast(variant: Variant) -> String {
     };
     format!(
         "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\nconst FALSE_COLORS = {false_colors}u;\nconst BOUNDED = {bounded};\n\
-         fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}"
+         fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}{}",
+        counting.source()
     )
 }
 
-/// Shared files first, the entry point last. Without the constants of [`ray_cast`].
+/// Shared files first, the entry point last. Without the constants of [`ray_cast`], and without what counts.
 const RAY_CAST: &str = concat!(
     include_str!("shaders/lib/constants.wgsl"),
     include_str!("shaders/lib/frame.wgsl"),
@@ -321,17 +340,22 @@ mod tests {
     fn module() -> naga::Module {
         let [joined, far] = [false; 2];
         let variant = Variant::new(1, MODE_EMISSION_ABSORPTION, joined, FALSE_NONE, far);
-        parsed(&ray_cast(variant))
+        parsed(&ray_cast(variant, Counting::ByGroups))
     }
 
     #[test]
     fn every_shader_is_valid_without_any_optional_feature() {
-        for (channels, mode, joined, false_colors, far) in VARIANTS {
+        let countings = [Counting::ByGroups, Counting::ByRays];
+        for ((channels, mode, joined, false_colors, far), counting) in VARIANTS
+            .into_iter()
+            .flat_map(|variant| countings.map(|counting| (variant, counting)))
+        {
             let mut validator = naga::valid::Validator::new(
                 naga::valid::ValidationFlags::all(),
                 naga::valid::Capabilities::empty(),
             );
-            let source = ray_cast(Variant::new(channels, mode, joined, false_colors, far));
+            let variant = Variant::new(channels, mode, joined, false_colors, far);
+            let source = ray_cast(variant, counting);
             let module = parsed(&source);
             validator
                 .validate(&module)

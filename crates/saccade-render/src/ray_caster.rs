@@ -5,7 +5,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use crate::layout::{FrameUniform, Variant, ray_cast};
+use crate::layout::{Counting, FrameUniform, Variant, ray_cast};
 
 #[cfg(not(target_family = "wasm"))]
 #[path = "ray_caster/native.rs"]
@@ -24,6 +24,7 @@ pub(crate) struct RayCaster {
     compiled: Arc<Mutex<Compiled>>,
     /// Whether others than the drawing thread compile.
     in_background: AtomicBool,
+    counting: Counting,
 }
 
 #[derive(Debug, Default)]
@@ -48,10 +49,11 @@ fn lock(compiled: &Mutex<Compiled>) -> MutexGuard<'_, Compiled> {
 
 impl RayCaster {
     /// With `in_background`, other threads compile what can wait, where there are threads.
-    pub(crate) fn new(device: &wgpu::Device, in_background: bool) -> Self {
+    pub(crate) fn new(device: &wgpu::Device, in_background: bool, counting: Counting) -> Self {
         Self {
             layout: bind_group_layout(device),
             compiled: Arc::default(),
+            counting,
             in_background: AtomicBool::new(in_background && platform::HAS_THREADS),
         }
     }
@@ -75,7 +77,7 @@ impl RayCaster {
             return stand_in;
         }
         drop(compiled);
-        let pipeline = pipeline(device, &self.layout, variant);
+        let pipeline = pipeline(device, &self.layout, variant, self.counting);
         let mut compiled = lock(&self.compiled);
         compiled.ready.insert(variant, pipeline.clone());
         pipeline
@@ -97,9 +99,10 @@ impl RayCaster {
         }
         let (device, layout) = (device.clone(), self.layout.clone());
         let (compiled, variants) = (Arc::clone(&self.compiled), new.clone());
+        let counting = self.counting;
         let started = platform::spawn(move || {
             for variant in variants {
-                let pipeline = pipeline(&device, &layout, variant);
+                let pipeline = pipeline(&device, &layout, variant, counting);
                 lock(&compiled).ready.insert(variant, pipeline);
             }
         });
@@ -176,10 +179,14 @@ fn bind_group_layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
 /// Compiles the ray-caster without counters that end its loops, which cost as much as what they count: each loop ends
 /// by itself, as a ray comes to its end whatever it meets, nodes have so many depths, and there are so many levels, channels and bricks.
 #[expect(unsafe_code, reason = "loops of our own that end need no counters")]
-fn shader_module(device: &wgpu::Device, variant: Variant) -> wgpu::ShaderModule {
+fn shader_module(
+    device: &wgpu::Device,
+    variant: Variant,
+    counting: Counting,
+) -> wgpu::ShaderModule {
     let descriptor = wgpu::ShaderModuleDescriptor {
         label: Some("ray-caster"),
-        source: wgpu::ShaderSource::Wgsl(ray_cast(variant).into()),
+        source: wgpu::ShaderSource::Wgsl(ray_cast(variant, counting).into()),
     };
     let checks = wgpu::ShaderRuntimeChecks {
         force_loop_bounding: false,
@@ -193,8 +200,9 @@ fn pipeline(
     device: &wgpu::Device,
     layout: &wgpu::BindGroupLayout,
     variant: Variant,
+    counting: Counting,
 ) -> wgpu::ComputePipeline {
-    let module = shader_module(device, variant);
+    let module = shader_module(device, variant, counting);
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some("ray-caster"),
         bind_group_layouts: &[Some(layout)],

@@ -6,6 +6,7 @@ use saccade_core::transfer::{ColorMap, OpacityPoint};
 
 use super::*;
 use crate::delivery::BrickVoxels;
+use crate::layout::Counting;
 
 /// The test adapter. Without one the test is skipped, unless `SACCADE_GPU_TESTS=require`.
 fn test_gpu() -> Option<Gpu> {
@@ -149,6 +150,46 @@ fn a_burst_of_bricks_is_spread_over_frames() {
     let resident: Vec<_> = renderer.memory.resident(0).collect();
     assert_eq!(octree.noted().len(), resident.len());
     assert!(octree.residency_is_complete());
+}
+
+/// What is counted does not depend on how.
+#[test]
+fn rays_are_counted_alike_alone_and_by_groups() {
+    let count = |counting, pixels| {
+        let gpu = test_gpu()?;
+        gpu.count(counting);
+        let (mut renderer, view) = crowded(&gpu, 1);
+        let size = UVec2::new(pixels, 13);
+        let view = View { size, ..view };
+        renderer
+            .set_channels(&views(0..1, Polarity::Bright))
+            .unwrap();
+        let voxels = vec![90; BRICK_STORED_VOXELS];
+        let mut counted = Vec::new();
+        for _ in 0..6 {
+            let report = frame(&mut renderer, &view);
+            // The finest level stays away: others stand in.
+            for id in report.misses.iter().filter(|id| id.level() > 0) {
+                let voxels = BrickVoxels::Voxels(&voxels);
+                renderer.deliver(*id, voxels).unwrap();
+            }
+            counted.push((report.statistics, report.fidelity));
+        }
+        Some(counted)
+    };
+    let Some(alone) = count(Counting::ByRays, 19) else {
+        return;
+    };
+    let groups = count(Counting::ByGroups, 19).expect("there was one");
+    assert_eq!(alone, groups);
+    let (last, fidelity) = alone[5];
+    assert!(last.samples > 0 && last.rays > 0 && last.lookups > 0 && last.nodes > 0);
+    assert!(last.substituted > 0 && fidelity.substituted_levels > 0);
+    assert!(fidelity.level.is_some(), "{fidelity:?}");
+    let [fewest, most] = last.lookups_per_ray;
+    assert!(fewest <= most && most > 0, "{last:?}");
+    let narrower = count(Counting::ByGroups, 18).expect("there was one");
+    assert_ne!(alone, narrower, "the comparison notices a column");
 }
 
 /// While a variant is compiled another draws, and nobody can tell.

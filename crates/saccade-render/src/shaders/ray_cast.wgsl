@@ -25,8 +25,6 @@ const FINER_SUBSTITUTES = 2u;
 // A substitute so many levels away is too coarse: the level this far away is asked for as well.
 const PREVIEW_LEVELS = 2u;
 
-var<workgroup> tallies: array<atomic<u32>, TALLIES>;
-
 var<private> samples: u32;
 var<private> rays: u32;
 var<private> substituted: u32;
@@ -774,35 +772,19 @@ fn main(
     if inside {
         let color = heat_of(traced);
         textureStore(image, pixel, vec4f(srgb_from_linear(color), 1.0));
-        atomicAdd(&tallies[COUNT_SAMPLES], samples);
-        atomicAdd(&tallies[COUNT_LOOKUPS], lookups);
-        atomicAdd(&tallies[COUNT_NODES], nodes_visited);
-        atomicAdd(&tallies[COUNT_SUBSTITUTED], substituted);
-        atomicMax(&tallies[MOST_SUBSTITUTED_LEVELS], substituted_levels);
+        add_to(COUNT_SAMPLES, samples);
+        add_to(COUNT_LOOKUPS, lookups);
+        add_to(COUNT_NODES, nodes_visited);
+        add_to(COUNT_SUBSTITUTED, substituted);
+        raise(MOST_SUBSTITUTED_LEVELS, substituted_levels);
         // Counted from the top, since zero means that no ray met the volume.
-        atomicMax(&tallies[FINEST_LEVEL], MAX_LEVELS - finest);
-        atomicAdd(&tallies[COUNT_RAYS], rays);
+        raise(FINEST_LEVEL, MAX_LEVELS - finest);
+        add_to(COUNT_RAYS, rays);
         if rays > 0u {
-            atomicMax(&tallies[MOST_LOOKUPS], lookups);
+            raise(MOST_LOOKUPS, lookups);
             // Counted from the top as well.
-            atomicMax(&tallies[FEWEST_LOOKUPS], 0xffffffffu - lookups);
+            raise(FEWEST_LOOKUPS, 0xffffffffu - lookups);
         }
     }
-    workgroupBarrier();
-    if local == 0u {
-        // What one group takes fits one word, what a large picture takes may not.
-        let taken = atomicLoad(&tallies[COUNT_SAMPLES]);
-        let before = atomicAdd(&report[COUNT_SAMPLES], taken);
-        if carry_of(before, taken) > 0u {
-            atomicAdd(&report[COUNT_SAMPLES_HIGH], 1u);
-        }
-        atomicAdd(&report[COUNT_LOOKUPS], atomicLoad(&tallies[COUNT_LOOKUPS]));
-        atomicAdd(&report[COUNT_NODES], atomicLoad(&tallies[COUNT_NODES]));
-        atomicAdd(&report[COUNT_SUBSTITUTED], atomicLoad(&tallies[COUNT_SUBSTITUTED]));
-        atomicMax(&report[MOST_SUBSTITUTED_LEVELS], atomicLoad(&tallies[MOST_SUBSTITUTED_LEVELS]));
-        atomicMax(&report[FINEST_LEVEL], atomicLoad(&tallies[FINEST_LEVEL]));
-        atomicAdd(&report[COUNT_RAYS], atomicLoad(&tallies[COUNT_RAYS]));
-        atomicMax(&report[MOST_LOOKUPS], atomicLoad(&tallies[MOST_LOOKUPS]));
-        atomicMax(&report[FEWEST_LOOKUPS], atomicLoad(&tallies[FEWEST_LOOKUPS]));
-    }
+    hand_over(local);
 }
