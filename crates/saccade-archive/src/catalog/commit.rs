@@ -148,8 +148,9 @@ impl<'c> Commit<'c> {
         } else {
             None
         };
-        // The newest record says where the tile lies, if any of it is inside then.
-        let newer = { existing.as_ref() }.filter(|e| e.transform_position > tile.position);
+        // The newest record says where the tile lies, if any of it is inside then; if this one is done once more, whoever
+        // moved the tile since.
+        let newer = { existing.as_ref() }.filter(|e| e.transform_position >= tile.position);
         let newer = newer.and_then(|e| Some((e.transform?, e.transform_position)));
         let inside = |at: &_| place(self.extent, tile.section, tile.size, *at).is_some();
         let newer = newer.filter(|(at, _)| inside(at));
@@ -233,10 +234,11 @@ impl<'c> Commit<'c> {
                 .await?;
             return Ok(TransformOutcome::Kept);
         };
-        let position = position.unwrap_or(existing.transform_position);
-        if existing.transform_position > position {
+        // One that is read once more says nothing new, and somebody may have moved the tile since.
+        if position.is_some_and(|position| existing.transform_position >= position) {
             return Ok(TransformOutcome::Unchanged);
         }
+        let position = position.unwrap_or(existing.transform_position);
         let place = self.place(tile, section, size, transform)?;
         self.end_misplacement(tile).await?;
         let moved = existing.transform != Some(transform);

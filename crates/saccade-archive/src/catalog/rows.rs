@@ -87,6 +87,13 @@ pub(super) fn volume_entry(row: &Row) -> Result<VolumeEntry, Error> {
     })
 }
 
+/// Voxels of a chunk, at most: no answer holds more. Ours have 2^17.
+const MOST_OF_A_CHUNK: u128 = 1 << 29;
+
+fn voxels_of(size: UVec3) -> u128 {
+    size.to_array().into_iter().map(u128::from).product()
+}
+
 /// What of a volume cannot be so, and others rely on.
 fn impossible(volume: &Volume, name: &str) -> Option<String> {
     let sizes = volume.levels.iter().map(|level| level.extent);
@@ -97,6 +104,9 @@ fn impossible(volume: &Volume, name: &str) -> Option<String> {
         () if volume.channels.is_empty() => "it has no channels",
         () if volume.extent().max_element() > MAX_EXTENT => "it is larger than a volume can be",
         () if sizes.any(|size| size.min_element() == 0) => "a level or its chunks have no voxels",
+        () if voxels_of(volume.chunk) > MOST_OF_A_CHUNK => {
+            "its chunks have more voxels than can be held"
+        }
         () => return None,
     };
     Some(wrong.to_owned())

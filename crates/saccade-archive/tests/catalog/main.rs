@@ -56,6 +56,8 @@ on_both! {
     suite::other_sizes_and_unknown_names_are_refused,
     spoilt::a_spoilt_tile_is_told_and_goes_with_its_next_record,
     spoilt::where_a_tile_of_no_size_lies_is_kept_until_it_has_one,
+    spoilt::a_record_that_is_done_once_more_moves_nothing_back,
+    spoilt::chunks_that_no_memory_holds_make_no_volume,
     spoilt::what_is_queued_and_cannot_be_understood_is_set_aside,
     spoilt::what_a_tile_names_is_not_on_the_list_of_what_is_to_be_deleted,
     whose::another_archives_catalog_is_neither_read_nor_written,

@@ -93,6 +93,46 @@ pub(crate) async fn where_a_tile_of_no_size_lies_is_kept_until_it_has_one(place:
     assert_eq!(changes[before].voxels, whole);
 }
 
+/// Repairs have records done anew, and a cursor that was lost all of them: what moved the tiles since still counts.
+pub(crate) async fn a_record_that_is_done_once_more_moves_nothing_back(place: &Place) {
+    let catalog = place.catalog().await;
+    let new = tile("a", 0, at(0.0, 0.0), 1);
+    let where_it_is = || async { catalog.tile("v", "a").await.unwrap().unwrap().transform };
+    let told = async |transform, position| {
+        let mut commit = catalog.begin("v").await.unwrap();
+        let outcome = commit.transform("a", transform, position).await.unwrap();
+        commit.finish().await.unwrap();
+        outcome
+    };
+    catalog.commit_tile("v", &new).await.unwrap();
+    // By somebody who writes no records.
+    assert_eq!(told(at(7.0, 1.0), None).await, TransformOutcome::Moved);
+    catalog.commit_tile("v", &new).await.unwrap();
+    assert_eq!(where_it_is().await, at(7.0, 1.0));
+    // By a record, and then by somebody.
+    assert_eq!(told(at(2.0, 2.0), Some(5)).await, TransformOutcome::Moved);
+    assert_eq!(told(at(9.0, 3.0), None).await, TransformOutcome::Moved);
+    catalog.commit_tile("v", &new).await.unwrap();
+    let again = told(at(2.0, 2.0), Some(5)).await;
+    assert_eq!(again, TransformOutcome::Unchanged);
+    assert_eq!(where_it_is().await, at(9.0, 3.0));
+    // What is new counts, be it a transform or an image.
+    assert_eq!(told(at(4.0, 4.0), Some(6)).await, TransformOutcome::Moved);
+    let image = tile("a", 0, at(1.0, 1.0), 8);
+    catalog.commit_tile("v", &image).await.unwrap();
+    assert_eq!(where_it_is().await, at(1.0, 1.0));
+}
+
+pub(crate) async fn chunks_that_no_memory_holds_make_no_volume(place: &Place) {
+    let catalog = place.catalog().await;
+    assert!(catalog.entry("v").await.is_ok());
+    let huge = "UPDATE volumes SET description = replace(description, '[64,64,32]', '[65536,65536,65536]')";
+    place.meddle(huge).await;
+    let told = catalog.entry("v").await.unwrap_err();
+    assert!(matches!(told, CatalogError::SpoiltVolume { .. }), "{told}");
+    assert!(told.to_string().contains("chunks"), "{told}");
+}
+
 pub(crate) async fn what_is_queued_and_cannot_be_understood_is_set_aside(place: &Place) {
     let catalog = place.catalog().await;
     let mut commit = catalog.begin("v").await.unwrap();
