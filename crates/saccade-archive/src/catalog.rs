@@ -38,6 +38,7 @@ mod origins;
 mod postgres;
 mod remembered;
 mod rows;
+mod soundness;
 mod spoilt;
 mod sqlite;
 mod tiles;

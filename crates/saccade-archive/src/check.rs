@@ -26,6 +26,7 @@ mod report;
 mod shared;
 #[cfg(test)]
 mod tests;
+mod unsound;
 
 pub use report::{CheckReport, Finding, FindingKind, Repair, count};
 
@@ -89,6 +90,9 @@ pub enum CheckError {
 /// moved to where its records say, and of tiles that name one pyramid, those of whose records it was not made are given back to
 /// ingest.
 ///
+/// The catalog's own file is looked at before, if it is SQLite's: where it is damaged, that alone is found. With
+/// [`CheckOptions::repair`] its indexes are made anew, and where it is sound then, the rest follows.
+///
 /// Where the records are at hand, the catalog is held against them: a tile that it lacks, or of which it says something else
 /// than the record, is found, and given back to ingest if that is wanted.
 ///
@@ -100,6 +104,13 @@ pub async fn check(
     options: &CheckOptions,
     progress: &(dyn Fn(u64, u64) + Sync),
 ) -> Result<CheckReport, CheckError> {
+    let unsound = unsound::look(archive, options).await?;
+    let is_sound = { unsound.iter() }.all(|finding| finding.repair.is_some());
+    let mut report = CheckReport::default();
+    report.findings.extend(unsound);
+    if !is_sound {
+        return Ok(report);
+    }
     let objects = archive.storage().entries("tiles/").await?;
     let volumes = archive.catalog().volumes().await?;
     let known = volumes
@@ -111,7 +122,7 @@ pub async fn check(
         options,
         progress,
         total,
-        report: CheckReport::default(),
+        report,
         hasher: Keyed::new(archive.randomness()),
         named: HashSet::new(),
         shared: HashSet::new(),

@@ -44,7 +44,12 @@ impl Finding {
         matches!(
             self.repair,
             Some(
-                Repair::Queued | Repair::Recounted | Repair::Moved | Repair::Kept | Repair::Reread
+                Repair::Queued
+                    | Repair::Recounted
+                    | Repair::Moved
+                    | Repair::Kept
+                    | Repair::Reread
+                    | Repair::Reindexed
             )
         )
     }
@@ -55,6 +60,8 @@ impl Finding {
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum FindingKind {
+    /// The catalog's own file is damaged: what it says means nothing until it is mended.
+    Unsound,
     /// The catalog names a pyramid that is not there.
     Missing,
     /// A pyramid is not what was written.
@@ -92,6 +99,8 @@ pub enum Repair {
     Kept,
     /// How far the records were read is found out from them: ingest goes on from there.
     Reread,
+    /// The indexes of the catalog's file are made anew, and it is sound.
+    Reindexed,
     /// The tile is in quarantine, for its record or image is not to be had.
     Quarantined,
 }

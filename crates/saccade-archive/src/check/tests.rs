@@ -12,6 +12,7 @@ use crate::image::GrayImage;
 use crate::pyramid::{Encoding, encode};
 
 mod rows;
+mod unsound;
 
 const VOLUME: &str = "v";
 const TILES: u32 = 6;

@@ -97,6 +97,7 @@ impl Check {
 
 fn name(kind: FindingKind) -> &'static str {
     match kind {
+        FindingKind::Unsound => "unsound",
         FindingKind::Missing => "missing",
         FindingKind::Damaged => "damaged",
         FindingKind::Mistaken => "mistaken",
@@ -126,6 +127,7 @@ fn line(finding: &Finding) -> String {
         Some(Repair::Deleted) => "; deleted",
         Some(Repair::Recounted) => "; counted anew",
         Some(Repair::Kept) => "; it is kept",
+        Some(Repair::Reindexed) => "; its indexes are made anew, and it is sound",
         Some(Repair::Reread) => "; `saccade ingest` goes on from what it has",
         Some(Repair::Moved) => "; moved to where its records say",
         Some(Repair::Queued) => "; `saccade ingest` makes it anew",
