@@ -299,8 +299,9 @@ pub enum CatalogError {
     },
     /// A table of the catalog's is not there.
     #[error(
-        "the catalog has no table {table:?}: it was damaged, or changed by another program. Put a copy of the catalog in its \
+        "the catalog has no table {table:?}{}: it was damaged, or changed by another program. Put a copy of the catalog in its \
          place, from which `saccade ingest` goes on and `saccade check` says what it lacks; without a copy, {}: {location}",
+        or_empty(table),
         without_copy(table)
     )]
     NoTable {
@@ -533,6 +534,14 @@ fn without_copy(table: &str) -> &'static str {
             "`saccade check --repair --acquisition FOLDER` makes the table anew, and `saccade ingest` takes in again what \
              was in it, from the records and images that are still there"
         }
+    }
+}
+
+/// Behind the name of a table that is also missed where there is nothing in it.
+fn or_empty(table: &str) -> &'static str {
+    match table {
+        "_sqlx_migrations" => ", which says what schema it has, or nothing in it",
+        _ => "",
     }
 }
 

@@ -371,6 +371,7 @@ async fn migrate(pool: &SqlitePool, path: &Path) -> Result<(), CatalogError> {
     let mut attempts = 0;
     loop {
         refuse_foreign_database(&mut connection, path).await?;
+        refuse_without_schema(&mut connection, path).await?;
         match MIGRATOR.run_direct(None, &mut *connection, false).await {
             Ok(()) => return Ok(()),
             Err(MigrateError::VersionMissing(found) | MigrateError::VersionTooNew(found, _)) => {
@@ -409,6 +410,7 @@ async fn refuse_other_schema(pool: &SqlitePool, path: &Path) -> Result<(), Catal
     let failed = |e| CatalogError::sort(e, &path.into());
     let mut connection = pool.acquire().await.map_err(failed)?;
     refuse_foreign_database(&mut connection, path).await?;
+    refuse_without_schema(&mut connection, path).await?;
     let query = sqlx::query_scalar("SELECT coalesce(max(version), 0) FROM _sqlx_migrations");
     let found: i64 = query.fetch_one(&mut *connection).await.map_err(failed)?;
     match found.cmp(&known_schema()) {
@@ -419,6 +421,39 @@ async fn refuse_other_schema(pool: &SqlitePool, path: &Path) -> Result<(), Catal
             known: known_schema(),
             location: path.into(),
         }),
+    }
+}
+
+/// Where a catalog does not say which schema it has, its tables would be made once more.
+async fn refuse_without_schema(
+    connection: &mut SqliteConnection,
+    path: &Path,
+) -> Result<(), CatalogError> {
+    let failed = |e| CatalogError::sort(e, &path.into());
+    // In this order: who makes the catalog at the same time enters its schema with its tables.
+    let question = "SELECT (SELECT count(*) FROM sqlite_schema WHERE type = 'table' AND name = 'volumes'), \
+                    (SELECT count(*) FROM sqlite_schema WHERE type = 'table' AND name = '_sqlx_migrations')";
+    let (volumes, schema): (i64, i64) = sqlx::query_as(question)
+        .fetch_one(&mut *connection)
+        .await
+        .map_err(failed)?;
+    if volumes == 0 {
+        return Ok(());
+    }
+    let says = if schema == 0 {
+        false
+    } else {
+        let question = "SELECT EXISTS (SELECT 1 FROM _sqlx_migrations)";
+        let asked = sqlx::query_scalar(question).fetch_one(connection);
+        asked.await.map_err(failed)?
+    };
+    if says {
+        Ok(())
+    } else {
+        Err(CatalogError::NoTable {
+            table: "_sqlx_migrations".to_owned(),
+            location: path.into(),
+        })
     }
 }
 

@@ -96,6 +96,34 @@ async fn a_newer_schema_is_refused() {
     );
 }
 
+/// Its tables would be made once more, which are there.
+#[tokio::test]
+async fn a_catalog_that_does_not_say_its_schema_is_named_with_the_way_out() {
+    for how in [
+        "DROP TABLE _sqlx_migrations",
+        "DELETE FROM _sqlx_migrations",
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalog.sqlite");
+        let catalog = Catalog::create(&path).await.unwrap();
+        catalog.create_volume(&volume("v")).await.unwrap();
+        catalog.close().await;
+        sql(&path, how).await;
+        let (opened, created) = (Catalog::open(&path).await, Catalog::create(&path).await);
+        for told in [opened, created] {
+            let told = told.unwrap_err();
+            assert!(
+                matches!(&told, CatalogError::NoTable { table, .. } if table == "_sqlx_migrations"),
+                "{how}: {told:?}"
+            );
+            let said = told.to_string();
+            for part in ["or nothing in it", "a copy", "into another archive"] {
+                assert!(said.contains(part), "{part:?} is not in: {said}");
+            }
+        }
+    }
+}
+
 /// Does something to the file behind the catalog's back.
 async fn sql(path: &Path, statements: &str) {
     use sqlx::Connection;
