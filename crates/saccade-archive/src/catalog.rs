@@ -62,7 +62,7 @@ pub use entries::{
 };
 pub use error::CatalogError;
 pub use location::CatalogLocation;
-pub use origins::Origin;
+pub use origins::{Naming, Origin};
 pub use spoilt::{Listed, SpoiltTile};
 pub use workers::{Claim, HeldUp, Worker};
 

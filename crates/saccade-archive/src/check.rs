@@ -3,7 +3,7 @@
 //! Objects are listed first and the catalog is read afterwards, so that a running ingest disturbs
 //! nothing: what it enters meanwhile is named by then, and what it is about to enter is young.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::hash::BuildHasher as _;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use futures::{StreamExt as _, stream};
 
 use crate::VisualizationArchive;
 use crate::acquisition::Cursor;
-use crate::catalog::{CatalogError, Tile, VolumeEntry, place};
+use crate::catalog::{CatalogError, Naming, Tile, VolumeEntry, place};
 use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
 use crate::storage::StorageError;
@@ -81,7 +81,7 @@ pub enum CheckError {
 ///
 /// Each tile's pyramid is read whole and decoded, and held against its checksums, its size, and its
 /// name; transforms and counts of the catalog are looked at, and objects that nothing names are
-/// listed. With [`CheckOptions::repair`], orphans of a safe age are deleted if they are of records that the catalog has
+/// listed. With [`CheckOptions::repair`], orphans of a safe age are deleted if no row of the catalog names them, be it of no volume, and if they are of records that the catalog has
 /// read: others are of later ones, if the catalog is an older copy, or somebody's own. A tile whose pyramid is
 /// missing or damaged is given back to ingest if the acquisition still has its record and image,
 /// and put into quarantine otherwise. What is whole and named is never touched, and neither is a
@@ -131,6 +131,7 @@ pub async fn check(
         known: volumes.iter().map(|volume| volume.name.clone()).collect(),
         read: None,
         records: None,
+        strays: None,
         compared: HashSet::new(),
         kept: HashSet::new(),
         miscounted: Vec::new(),
@@ -174,6 +175,8 @@ struct Check<'a> {
     read: Option<Cursor>,
     /// What they say, if they are at hand.
     records: Option<records::Records>,
+    /// Rows by the hashes of the pyramids that they name, of those that no volume's tiles name; `None` until that is wanted.
+    strays: Option<HashMap<u64, Naming>>,
     /// Volumes that were held against their records.
     compared: HashSet<String>,
     /// Volumes and positions of records of tiles whose rows do not name the pyramid that may be theirs.

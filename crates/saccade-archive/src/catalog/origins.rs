@@ -13,7 +13,34 @@ pub struct Origin {
     pub transform_position: u64,
 }
 
+/// A row of the table of tiles, of whichever volume, be the tile there or deleted.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Naming {
+    /// Its number: larger than those before it.
+    pub row: i64,
+    /// What can be read of the tile's name.
+    pub tile: String,
+    /// What can be read of the name of its pyramid; nothing of most that are deleted.
+    pub pyramid: String,
+    /// Number of the volume whose it is said to be.
+    pub volume: i64,
+    /// Whether the catalog has a volume of that number.
+    pub has_volume: bool,
+}
+
 impl Catalog {
+    /// Rows of the table of tiles after one, by their numbers, some thousand at once: also those that are found by no volume.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn namings_after(&self, row: i64) -> Result<Vec<Naming>, CatalogError> {
+        let question = "SELECT t.id AS id, t.name AS name, t.pyramid AS pyramid, t.volume AS volume, \
+                        coalesce(v.id, -1) AS found FROM tiles AS t LEFT JOIN volumes AS v ON v.id = t.volume \
+                        WHERE t.id > $1 ORDER BY t.id LIMIT 4096";
+        self.ask(question, &[row.into()], rows::naming).await
+    }
+
     /// The tiles that name a pyramid, by their ids. Looks at all tiles of the volume.
     ///
     /// # Errors

@@ -10,7 +10,7 @@ use sqlx::Error;
 
 use super::database::Row;
 use super::{
-    CatalogChange, ChangeReason, Claim, HeldUp, Origin, Quarantined, Retired, SpoiltTile,
+    CatalogChange, ChangeReason, Claim, HeldUp, Naming, Origin, Quarantined, Retired, SpoiltTile,
     Statistics, Tile, TileId, VolumeEntry, Waiting,
 };
 use crate::acquisition::Cursor;
@@ -248,6 +248,17 @@ pub(super) fn claim(row: &Row) -> Result<Claim, Error> {
         waiting: waiting(row)?,
         deaths: small(row, "attempts")?,
         parked: parked != 0,
+    })
+}
+
+pub(super) fn naming(row: &Row) -> Result<Naming, Error> {
+    let volume = row.get("volume")?;
+    Ok(Naming {
+        row: row.get("id")?,
+        tile: legible(row, "name"),
+        pyramid: legible(row, "pyramid"),
+        volume,
+        has_volume: row.get::<i64>("found")? == volume,
     })
 }
 

@@ -1,10 +1,11 @@
 //! What nothing names.
 
+use std::collections::HashMap;
 use std::hash::BuildHasher as _;
 
 use super::repair::position_of;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
-use crate::catalog::CatalogError;
+use crate::catalog::{CatalogError, Naming};
 use crate::storage::Entry;
 
 impl Check<'_> {
@@ -22,6 +23,15 @@ impl Check<'_> {
             let age = object.modified.and_then(|at| now.duration_since(at).ok());
             if age.is_none_or(|age| age < self.options.safe_age) {
                 self.report.young += 1;
+                continue;
+            }
+            if self.strays.is_none() {
+                self.strays = Some(self.find_strays().await?);
+            }
+            let hash = self.hasher.hash_one(&object.name);
+            let stray = self.strays.as_ref().and_then(|all| all.get(&hash));
+            if let Some(stray) = stray.cloned() {
+                self.stray(object, volume, stray).await?;
                 continue;
             }
             let origin = self.whence(&object.name).await?;
@@ -58,6 +68,62 @@ impl Check<'_> {
                 repair,
             });
         }
+        Ok(())
+    }
+
+    /// Rows that name pyramids of which no tile that was met does.
+    async fn find_strays(&self) -> Result<HashMap<u64, Naming>, CheckError> {
+        let (mut strays, mut after) = (HashMap::new(), i64::MIN);
+        loop {
+            let rows = self.archive.catalog().namings_after(after).await?;
+            let Some(last) = rows.last() else {
+                return Ok(strays);
+            };
+            after = last.row;
+            for row in rows {
+                let hash = self.hasher.hash_one(&row.pyramid);
+                if !self.named.contains(&hash) {
+                    strays.insert(hash, row);
+                }
+            }
+        }
+    }
+
+    /// An object is named by a row that was not met with the tiles of its volume.
+    async fn stray(
+        &mut self,
+        object: &Entry,
+        volume: &str,
+        stray: Naming,
+    ) -> Result<(), CheckError> {
+        let named = self.archive.catalog().is_named(volume, &object.name);
+        match named.await {
+            // It was entered since the tiles were looked at.
+            Ok(true) => {
+                self.report.young += 1;
+                return Ok(());
+            }
+            Ok(false) | Err(CatalogError::UnknownVolume { .. }) => {}
+            Err(error) => return Err(error.into()),
+        }
+        self.doubtful.insert(volume.to_owned());
+        let why = if stray.has_volume {
+            "it is not met with the tiles of its volume".to_owned()
+        } else {
+            format!("the catalog has no volume of its number {}", stray.volume)
+        };
+        self.report.findings.push(Finding {
+            kind: FindingKind::Spoilt,
+            volume: None,
+            tile: Some(stray.tile),
+            object: Some(object.name.clone()),
+            reason: format!(
+                "a row of the catalog names these {} bytes, but {why}: they are never deleted. Put a copy of the catalog in its \
+                 place; without one, `saccade check --repair --acquisition FOLDER` finds from the records which tiles are lost",
+                object.size
+            ),
+            repair: None,
+        });
         Ok(())
     }
 

@@ -46,6 +46,13 @@ pub(crate) async fn a_spoilt_tile_is_told_and_goes_with_its_next_record(place: &
         assert_eq!(names, [Ok("a"), Err(Ok("b"))], "{how}");
         let entry = catalog.entry("v").await.unwrap();
         assert_eq!(entry.tiles, 2);
+        // So it is by the table alone.
+        let namings = catalog.namings_after(i64::MIN).await.unwrap();
+        let named: Vec<_> = { namings.iter() }
+            .map(|naming| (&*naming.tile, naming.has_volume))
+            .collect();
+        assert_eq!(named, [("a", true), ("b", true)], "{how}");
+        assert_eq!(catalog.namings_after(namings[1].row).await.unwrap(), []);
         // Its next record takes its place, and its last one ends it.
         let new = tile("b", 1, at(5.0, 0.0), 2);
         let outcome = catalog.commit_tile("v", &new).await.unwrap();

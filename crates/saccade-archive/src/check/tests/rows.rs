@@ -5,6 +5,7 @@ use std::fs;
 use glam::{DVec2, DVec3, UVec2, UVec3};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Volume;
+use sqlx::{ConnectOptions as _, Connection as _};
 
 use super::*;
 use crate::acquisition::{AcquisitionInfo, TransformRecord};
@@ -329,4 +330,52 @@ async fn wrong_counts_are_made_right() {
     assert_eq!(catalog.sections(VOLUME).await.unwrap(), [0, 1, 2]);
     let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
     assert_eq!(report.findings, []);
+}
+
+/// Nothing looks for tiles of a volume that is not there.
+#[tokio::test]
+async fn what_a_row_of_no_volume_names_is_told_and_not_deleted() {
+    let statements = [
+        "PRAGMA foreign_keys = OFF",
+        "UPDATE tiles SET volume = 2",
+        "UPDATE volumes SET tiles = 0",
+        "DELETE FROM sections",
+    ];
+    let fixture = Fixture::new().await;
+    let file = fixture.folder.path().join("catalog.sqlite");
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(file);
+    let mut meddle = options.foreign_keys(false).connect().await.unwrap();
+    for statement in statements {
+        sqlx::query(statement).execute(&mut meddle).await.unwrap();
+    }
+    meddle.close().await.unwrap();
+    let stray = fixture.folder.path().join("tiles/v/000000/stray-7.tif");
+    fs::write(&stray, "stray").unwrap();
+    let options = CheckOptions {
+        repair: true,
+        safe_age: Duration::ZERO,
+        ..CheckOptions::default()
+    };
+    for gone in [true, false] {
+        let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let (strays, others): (Vec<_>, Vec<_>) =
+            { report.findings.iter() }.partition(|f| f.kind == FindingKind::Spoilt);
+        let told: Vec<_> = { strays.iter() }
+            .map(|f| (f.tile.clone().unwrap(), f.repair))
+            .collect();
+        let want: Vec<_> = (0..TILES).map(|n| (format!("t{n}"), None)).collect();
+        assert_eq!((told, report.damage()), (want, 6));
+        for word in [
+            "no volume of its number 2",
+            "never deleted",
+            "--acquisition",
+        ] {
+            assert!(strays[0].reason.contains(word), "{}", strays[0].reason);
+        }
+        // What is nobody's is still deleted.
+        let others: Vec<_> = others.iter().map(|f| (f.kind, f.repair)).collect();
+        let want = (FindingKind::Orphan, Some(Repair::Deleted));
+        assert_eq!(others, vec![want; usize::from(gone)]);
+        assert!((0..6).all(|n| fixture.path(n).is_file()) && !stray.exists());
+    }
 }
