@@ -4,6 +4,7 @@ mod channels;
 mod power_cuts;
 mod refused;
 mod registration;
+mod replaced;
 mod replayed;
 mod stage;
 mod twice;

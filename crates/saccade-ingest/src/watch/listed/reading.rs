@@ -139,7 +139,10 @@ impl<F: Folders> ListWatch<F> {
 
     /// The tiles as replay knows them; those that are not there count as large as the largest of the others.
     pub(super) fn raw(&self, listing: &Listing) -> Vec<RawTile> {
-        let size = |name: &str| Some(self.tiles.get(name)?.told.as_ref()?.size);
+        let size = |name: &str| {
+            let size = self.tiles.get(name)?.told.as_ref()?.size;
+            (size != UVec2::ZERO).then_some(size)
+        };
         let sizes = listing.tiles.iter().filter_map(|tile| size(&tile.name));
         let largest = sizes.max_by_key(|size| u64::from(size.x) * u64::from(size.y));
         raw(&listing.tiles, |n: usize| {
@@ -246,6 +249,12 @@ impl<F: Folders> ListWatch<F> {
         }
         self.missing.clear();
         self.unclear.clear();
+        // What was told of an image that was replaced since says nothing.
+        for unread in &self.unread {
+            if let Some(told) = { self.tiles.get_mut(&unread.tile) }.and_then(|t| t.told.as_mut()) {
+                told.size = UVec2::ZERO;
+            }
+        }
         let before = std::mem::take(&mut self.unread).into_iter();
         let mut before: HashMap<_, _> =
             before.map(|unread| (unread.tile.clone(), unread)).collect();

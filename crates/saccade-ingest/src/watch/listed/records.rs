@@ -12,7 +12,7 @@ use saccade_archive::acquisition::{
 use saccade_archive::image::read_size;
 
 use super::super::list::{self, List};
-use super::super::stamp::Seen;
+use super::super::stamp::{Seen, Stamp};
 use super::super::{Folders, LINK, PATIENCE, file_name};
 use super::index::{Sought, base, key};
 use super::{Image, ListError, ListWatch, Tile, Told};
@@ -146,8 +146,33 @@ impl<F: Folders> ListWatch<F> {
                 }
                 (key(&file), seen)
             });
+            let was_replaced = stamp.is_some_and(|stamp| self.was_replaced(&file, &stamp));
             self.seen.insert(key(&file), seen.map(|(_, seen)| seen));
             self.untold.push_back((Record::Tile(record), seen));
+            if was_replaced {
+                // Nobody else will see it: what the file looks like now is known from here on.
+                self.tell_others_again(&file, &unread.tile, now);
+            }
+        }
+    }
+
+    /// Whether a file is another than the one that was told of before.
+    fn was_replaced(&self, file: &str, stamp: &Stamp) -> bool {
+        match self.seen.get(&key(file)) {
+            Some(Some(before)) => before.is_replaced_by(Seen::of(stamp)),
+            Some(None) => stamp.modified > self.told_until,
+            None => false,
+        }
+    }
+
+    /// The image of all tiles that show a file, but for one, is another.
+    fn tell_others_again(&mut self, file: &str, but: &str, now: SystemTime) {
+        let tiles = self.by_name.get(&key(base(file))).cloned();
+        for tile in tiles.unwrap_or_default() {
+            let told = self.tiles.get(&tile).and_then(|tile| tile.told.as_ref());
+            if &*tile != but && told.is_some_and(|told| told.file == file) {
+                self.tell_again(&tile, now);
+            }
         }
     }
 }
