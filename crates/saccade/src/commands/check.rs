@@ -112,17 +112,20 @@ fn name(kind: FindingKind) -> &'static str {
 }
 
 fn line(finding: &Finding) -> String {
-    let mut line = format!("{}:", name(finding.kind));
+    let mut whose = String::new();
     if let Some(tile) = &finding.tile {
-        line.push_str(&format!(" tile {tile}"));
+        whose.push_str(&format!(" tile {tile}"));
     }
     if let Some(volume) = &finding.volume {
-        line.push_str(&format!(" of {volume}"));
+        whose.push_str(&format!(" of {volume}"));
     }
     if let Some(object) = &finding.object {
-        line.push_str(&format!(" ({object})"));
+        whose.push_str(&format!(" ({object})"));
     }
-    line.push_str(&format!(": {}", finding.reason));
+    if !whose.is_empty() {
+        whose.push(':');
+    }
+    let mut line = format!("{}:{whose} {}", name(finding.kind), finding.reason);
     line.push_str(match finding.repair {
         Some(Repair::Deleted) => "; deleted",
         Some(Repair::Recounted) => "; counted anew",
