@@ -72,6 +72,20 @@ impl Catalog {
         Ok(largest.and_then(|position| u64::try_from(position).ok()))
     }
 
+    /// Whether the record at a position is in the queue, or waits.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn is_to_be_done(&self, volume: &str, position: u64) -> Result<bool, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT position FROM waiting WHERE volume = $1 AND position = $2";
+        let there = |row: &Row| row.get::<i64>("position");
+        let values = [id.into(), position.into()];
+        let found = self.ask(question, &values, there);
+        Ok(!found.await?.is_empty())
+    }
+
     /// The records whose file is not whole yet, by position; without what cannot be understood.
     ///
     /// # Errors

@@ -35,6 +35,10 @@ impl Check<'_> {
                 continue;
             }
             let origin = self.whence(&object.name).await?;
+            if origin == Whence::ToBeDone {
+                self.report.young += 1;
+                continue;
+            }
             let may_be_lost = origin == Whence::Read && self.lacking.contains(volume);
             if may_be_lost {
                 self.doubtful.insert(volume.to_owned());
@@ -50,7 +54,7 @@ impl Check<'_> {
                     ", but the catalog lacks tiles, of which it may be: with --acquisition FOLDER the records tell; until then \
                      they are not deleted"
                 }
-                Whence::Read => "",
+                Whence::Read | Whence::ToBeDone => "",
                 Whence::Later => {
                     ", which are of a record that the catalog has not read: if it is an older copy, `saccade ingest` goes on \
                      from there; they are never deleted"
@@ -147,6 +151,8 @@ impl Check<'_> {
 enum Whence {
     /// A record that the catalog has read: what came of it is entered, or will never be.
     Read,
+    /// One that ingest is to work on, once more if a repair gave it back: the tile may be named again, and its image be gone.
+    ToBeDone,
     /// One that it has not read.
     Later,
     /// None of this catalog's volumes.
@@ -162,8 +168,15 @@ impl Check<'_> {
         let (Some(position), Ok(_)) = (position_of(pyramid), section.parse::<u32>()) else {
             return Ok(Whence::Foreign);
         };
-        match self.archive.catalog().cursor(volume).await {
-            Ok(read) if position < read.offset => Ok(Whence::Read),
+        let catalog = self.archive.catalog();
+        match catalog.cursor(volume).await {
+            Ok(read) if position < read.offset => {
+                let to_be_done = catalog.is_to_be_done(volume, position).await?;
+                Ok(match to_be_done {
+                    true => Whence::ToBeDone,
+                    false => Whence::Read,
+                })
+            }
             Ok(_) => Ok(Whence::Later),
             // How far they were read is not known.
             Err(CatalogError::SpoiltCursor { .. }) => Ok(Whence::Later),

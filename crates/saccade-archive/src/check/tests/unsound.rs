@@ -101,3 +101,16 @@ async fn of_tables_that_have_lost_tiles_nothing_is_deleted_or_counted() {
         assert_eq!(entry.tiles, u64::from(TILES));
     }
 }
+
+/// Somebody who repairs twice, before ingest has worked on what was found the first time.
+#[tokio::test]
+async fn pyramids_of_lost_tiles_outlast_any_number_of_repairs() {
+    let fixture = Fixture::new().await;
+    fixture.meddle(&["DELETE FROM tiles"]).await;
+    for round in 0..3 {
+        let report = fixture.repair(true).await;
+        assert!(fixture.has_all(), "{round}: {:?}", report.findings);
+    }
+    let (queued, parked) = fixture.archive.catalog().queued(VOLUME).await.unwrap();
+    assert_eq!(queued + parked, u64::from(TILES));
+}
