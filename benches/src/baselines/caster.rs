@@ -5,6 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context as _, Result, bail, ensure};
 use glam::{DVec3, UVec3, Vec3};
 use saccade_core::brick::{BRICK_STORED_EDGE, BRICK_STORED_VOXELS, BrickId, bricks_of};
+use saccade_core::transfer::TABLE_LEN;
 use saccade_core::volume::{Dtype, Volume};
 use saccade_render::wgpu::util::DeviceExt as _;
 use saccade_render::{ChannelView, Gpu, View, wgpu};
@@ -20,6 +21,7 @@ const COUNTERS: usize = 16;
 const MASK_WORDS: usize = 65_536;
 const MISSES: usize = 65_536;
 const MAX_LEVELS: usize = 32;
+const NODE_ROW: usize = 4096;
 /// Nodes of each channel that the short stack remembers, as in the paper.
 const STACK: u32 = 4;
 
@@ -62,38 +64,106 @@ pub(crate) struct Baseline {
     /// What each slot holds.
     slots: Vec<BrickId>,
     usage_words: usize,
-    /// Index, blocks, ranges, as of the last upload.
-    on_device: Option<[wgpu::Buffer; 3]>,
+    /// As of the last upload.
+    on_device: Option<Index>,
     image: Option<wgpu::Texture>,
+}
+
+/// What leads to bricks.
+struct Index {
+    /// Values of the brick in each slot.
+    ranges: wgpu::Buffer,
+    way: Way,
+}
+
+enum Way {
+    /// Directory and blocks.
+    PageTables([wgpu::Buffer; 2]),
+    Nodes(wgpu::TextureView),
+}
+
+impl Index {
+    fn new(gpu: &Gpu, paged: &Paged, first_level: u32) -> Self {
+        let storage = |words: &[u32]| {
+            let mut words = words.to_vec();
+            // Buffers may not be empty.
+            words.resize(words.len().max(4), 0);
+            let device = gpu.device();
+            device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+                label: Some("baseline"),
+                contents: bytemuck::cast_slice(&words),
+                usage: wgpu::BufferUsages::STORAGE,
+            })
+        };
+        let way = match paged.nodes(first_level) {
+            None => Way::PageTables([&paged.directory, &paged.blocks].map(|words| storage(words))),
+            Some(mut nodes) => {
+                nodes.resize(nodes.len().next_multiple_of(NODE_ROW), [0; 4]);
+                let format = wgpu::TextureFormat::Rgba32Uint;
+                Way::Nodes(texels(gpu, format, NODE_ROW, &nodes))
+            }
+        };
+        let ranges = storage(&paged.ranges);
+        Self { ranges, way }
+    }
+
+    fn way(&self) -> Vec<wgpu::BindingResource<'_>> {
+        match &self.way {
+            Way::PageTables(buffers) => {
+                let buffers = buffers.iter().map(wgpu::Buffer::as_entire_binding);
+                buffers.collect()
+            }
+            Way::Nodes(nodes) => vec![wgpu::BindingResource::TextureView(nodes)],
+        }
+    }
 }
 
 /// How channels look.
 struct Looks {
-    colors: wgpu::Buffer,
-    opaque_before: wgpu::Buffer,
+    colors: wgpu::TextureView,
+    opaque_before: wgpu::TextureView,
     /// Scale and offset of each channel's table.
     tables: Vec<[f32; 2]>,
+}
+
+/// A texture of so wide rows of texels.
+fn texels<T: bytemuck::NoUninit>(
+    gpu: &Gpu,
+    format: wgpu::TextureFormat,
+    width: usize,
+    texels: &[T],
+) -> wgpu::TextureView {
+    let rows = texels.len() / width;
+    let word = |n: usize| u32::try_from(n).expect("rows of a few megabytes");
+    let texture = gpu.device().create_texture_with_data(
+        gpu.queue(),
+        &wgpu::TextureDescriptor {
+            label: Some("baseline"),
+            size: size_3d(UVec3::new(word(width), word(rows), 1)),
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D2,
+            format,
+            usage: wgpu::TextureUsages::TEXTURE_BINDING,
+            view_formats: &[],
+        },
+        wgpu::util::TextureDataOrder::LayerMajor,
+        bytemuck::cast_slice(texels),
+    );
+    texture.create_view(&wgpu::TextureViewDescriptor::default())
 }
 
 impl Looks {
     fn new(gpu: &Gpu, views: &[ChannelView], dtype: Dtype) -> Self {
         let tables: Vec<_> = views.iter().map(|view| Table::new(view, dtype)).collect();
-        let storage = |words: &[u8]| {
-            let device = gpu.device();
-            device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
-                label: Some("baseline"),
-                contents: words,
-                usage: wgpu::BufferUsages::STORAGE,
-            })
-        };
         let colors: Vec<_> = tables.iter().flat_map(|t| t.colors.clone()).collect();
         let opaque: Vec<_> = tables
             .iter()
             .flat_map(|t| t.opaque_before.clone())
             .collect();
         Self {
-            colors: storage(bytemuck::cast_slice(&colors)),
-            opaque_before: storage(bytemuck::cast_slice(&opaque)),
+            colors: texels(gpu, wgpu::TextureFormat::Rgba32Float, TABLE_LEN, &colors),
+            opaque_before: texels(gpu, wgpu::TextureFormat::R32Uint, TABLE_LEN + 1, &opaque),
             tables: tables.iter().map(|t| [t.scale, t.offset]).collect(),
         }
     }
@@ -307,22 +377,10 @@ impl Baseline {
     fn draw(&mut self, view: &View, counting: bool, frames: u32) -> Result<()> {
         let device = self.gpu.device();
         let first = first_level(&self.views, u32::MAX);
-        if self.on_device.is_none() {
-            let [index, blocks] = self.paged.words(first);
-            let buffers = [index, blocks, self.paged.ranges.clone()].map(|mut words| {
-                // Buffers may not be empty.
-                words.resize(words.len().max(4), 0);
-                device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
-                    label: Some("baseline"),
-                    contents: bytemuck::cast_slice(&words),
-                    usage: wgpu::BufferUsages::STORAGE,
-                })
-            });
-            self.on_device = Some(buffers);
-        }
-        let Some([index, blocks, ranges]) = &self.on_device else {
-            bail!("nothing is on the device");
-        };
+        let words = self.frame(view, counting);
+        let index = self
+            .on_device
+            .get_or_insert_with(|| Index::new(&self.gpu, &self.paged, first));
         let is_size = |i: &wgpu::Texture| [i.width(), i.height()] == view.size.to_array();
         let image = match self.image.take() {
             Some(image) if is_size(&image) => image,
@@ -330,7 +388,7 @@ impl Baseline {
         };
         let frame = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("baseline frame"),
-            contents: bytemuck::cast_slice(&self.frame(view, counting)),
+            contents: bytemuck::cast_slice(&words),
             usage: wgpu::BufferUsages::UNIFORM,
         });
         let [texture, target] =
@@ -338,20 +396,18 @@ impl Baseline {
         let resources = [
             frame.as_entire_binding(),
             self.report.as_entire_binding(),
-            self.looks.colors.as_entire_binding(),
-            self.looks.opaque_before.as_entire_binding(),
-            ranges.as_entire_binding(),
+            wgpu::BindingResource::TextureView(&self.looks.colors),
+            wgpu::BindingResource::TextureView(&self.looks.opaque_before),
+            index.ranges.as_entire_binding(),
             wgpu::BindingResource::TextureView(&texture),
             wgpu::BindingResource::Sampler(&self.sampler),
             wgpu::BindingResource::TextureView(&target),
-            index.as_entire_binding(),
-            blocks.as_entire_binding(),
         ];
-        let entries = (0..).zip(resources);
+        let entries = (0..).zip(resources.into_iter().chain(index.way()));
         let entries = entries.map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource });
         let bind_group = device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some("baseline"),
-            layout: &layout(device),
+            layout: &layout(device, self.paged.is_octree()),
             entries: &entries.collect::<Vec<_>>(),
         });
         for _ in 0..frames {
@@ -407,18 +463,17 @@ impl Baseline {
         }
         for index in 0..MAX_LEVELS {
             let Some(level) = self.volume.levels.get(index) else {
-                rows.extend([[0; 4]; 5]);
+                rows.extend([[0; 4]; 4]);
                 continue;
             };
             let table = tables.levels()[index];
             let voxel_nm = self.volume.voxel_nm * level.downsampling;
-            let down = level.downsampling.as_uvec3().to_array().map(u32::ilog2);
+            let [x, y, z] = level.downsampling.as_uvec3().to_array().map(u32::ilog2);
             rows.extend([
                 row(eye / voxel_nm, table.directory_base),
-                row(1.0 / voxel_nm, 0),
+                row(1.0 / voxel_nm, x | y << 8 | z << 16),
                 counts(table.bricks, 0),
                 counts(table.directory, 0),
-                counts(down.into(), 0),
             ]);
         }
         rows
@@ -492,33 +547,41 @@ fn picture(device: &wgpu::Device, view: &View) -> wgpu::Texture {
     })
 }
 
-fn layout(device: &wgpu::Device) -> wgpu::BindGroupLayout {
+fn layout(device: &wgpu::Device, octree: bool) -> wgpu::BindGroupLayout {
     let buffer = |ty| wgpu::BindingType::Buffer {
         ty,
         has_dynamic_offset: false,
         min_binding_size: None,
     };
     let storage = |read_only| buffer(wgpu::BufferBindingType::Storage { read_only });
-    let types = [
+    let texture = |sample_type, view_dimension| wgpu::BindingType::Texture {
+        sample_type,
+        view_dimension,
+        multisampled: false,
+    };
+    let filterable = |filterable| wgpu::TextureSampleType::Float { filterable };
+    let (whole, flat) = (
+        wgpu::TextureSampleType::Uint,
+        wgpu::TextureViewDimension::D2,
+    );
+    let mut types = vec![
         buffer(wgpu::BufferBindingType::Uniform),
         storage(false),
+        texture(filterable(false), flat),
+        texture(whole, flat),
         storage(true),
-        storage(true),
-        storage(true),
-        wgpu::BindingType::Texture {
-            sample_type: wgpu::TextureSampleType::Float { filterable: true },
-            view_dimension: wgpu::TextureViewDimension::D3,
-            multisampled: false,
-        },
+        texture(filterable(true), wgpu::TextureViewDimension::D3),
         wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
         wgpu::BindingType::StorageTexture {
             access: wgpu::StorageTextureAccess::WriteOnly,
             format: wgpu::TextureFormat::Rgba8Unorm,
-            view_dimension: wgpu::TextureViewDimension::D2,
+            view_dimension: flat,
         },
-        storage(true),
-        storage(true),
     ];
+    types.extend(match octree {
+        true => vec![texture(whole, flat)],
+        false => vec![storage(true); 2],
+    });
     let entries = (0..).zip(types);
     let entries = entries.map(|(binding, ty)| wgpu::BindGroupLayoutEntry {
         binding,
@@ -557,7 +620,7 @@ fn pipeline(gpu: &Gpu, method: Method, channels: usize) -> wgpu::ComputePipeline
     let module = shader_module(device, "baseline", &source);
     let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some("baseline"),
-        bind_group_layouts: &[Some(&layout(device))],
+        bind_group_layouts: &[Some(&layout(device, method.is_octree()))],
         immediate_size: 0,
     });
     device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {

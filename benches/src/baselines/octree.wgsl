@@ -4,83 +4,94 @@
 // With STACK = 0 each search begins at the top (kd-restart). Otherwise it begins at the lowest of the
 // STACK nodes above the last one that holds the place, and at the top where none does (kd-shortstack).
 
-const NODE_WORDS = 1u + 2u * SLOTS;
-const STACK_SIZE = max(STACK, 1u);
+// A texel per node and channel, as the product's nodes: children, the entry of the brick, the bounds of its values.
+@group(0) @binding(8) var nodes: texture_2d<u32>;
 
-// Of the last search: the brick it ended in, its level, and the nodes on the way, by level modulo STACK.
-var<private> last_brick: array<vec3u, SLOTS>;
-var<private> last_level: array<u32, SLOTS>; // one more; 0 is none
-var<private> stack: array<array<u32, STACK_SIZE>, SLOTS>;
-// The highest level of which the stack holds a node.
-var<private> stack_top: array<u32, SLOTS>;
+const NODE_ROW = 4096u;
 
-// The brick of a level that a brick of a finer one lies in.
-fn above(brick: vec3u, level: u32, coarser: u32) -> vec3u {
-    return brick >> (frame.levels[coarser].down - frame.levels[level].down);
+// Of the last search: the node it ended in and those above it, in registers; how many of them; and where that was.
+var<private> stack: array<vec4u, SLOTS>;
+var<private> held: array<u32, SLOTS>;
+var<private> last_brick: array<vec3u, SLOTS>; // of its level
+var<private> last_level: array<u32, SLOTS>;
+
+fn down_of(level: u32) -> vec3u {
+    return axes(frame.levels[level].down);
 }
 
-fn find(channel: u32, wanted: u32, depth: f32, ray: vec3f) -> Spot {
-    let place = brick_at(wanted, depth, ray);
-    var level = max(frame.start_level, wanted);
-    let top = above(place, wanted, level);
-    let across = frame.levels[level].bricks;
-    var node = (top.z * across.y + top.y) * across.x + top.x;
-    var is_restart = true;
-    if STACK > 0u && last_level[channel] > 0u {
-        let deepest = last_level[channel] - 1u;
-        for (var k = 0u; k < STACK; k += 1u) {
-            let at = deepest + k;
-            if at > stack_top[channel] {
+fn find(channel: u32, depth: f32) -> Spot {
+    let wanted = grid.level;
+    let place = brick_at(depth);
+    let wanted_down = axes(grid.down);
+    var level = max(steady.start_level, wanted);
+    var way = vec4u(0u);
+    var ways = 0u;
+    if STACK > 0u {
+        way = stack[channel];
+        ways = held[channel];
+        let deepest = last_level[channel];
+        let deepest_down = down_of(deepest);
+        var at = deepest;
+        loop {
+            if ways == 0u {
                 break;
             }
-            if at >= wanted && at <= level && all(above(place, wanted, at) == above(last_brick[channel], deepest, at)) {
-                node = stack[channel][at % STACK_SIZE];
-                level = at;
-                is_restart = false;
+            let down = down_of(at);
+            let is_above = at >= wanted && at <= level;
+            if is_above && all((place >> (down - wanted_down)) == (last_brick[channel] >> (down - deepest_down))) {
                 break;
             }
+            at += 1u;
+            ways -= 1u;
+            way = vec4u(way.yzw, 0u);
         }
+        level = select(level, at, ways > 0u);
     }
-    if STACK > 0u && is_restart {
-        stack_top[channel] = level;
+    var down = down_of(level);
+    if ways == 0u {
+        let top = place >> (down - wanted_down);
+        let across = select(steady.start_bricks, grid.bricks, wanted > steady.start_level);
+        way = vec4u((top.z * across.y + top.y) * across.x + top.x, 0u, 0u, 0u);
+        ways = 1u;
     }
-    var here = Spot(EMPTY, level, above(place, wanted, level), 0.0);
+    var entry = EMPTY;
     loop {
         work += 1u;
-        let first = node * NODE_WORDS;
-        if STACK > 0u {
-            stack[channel][level % STACK_SIZE] = node;
-            stack_top[channel] = min(stack_top[channel], level + STACK - 1u);
-        }
-        let entry = index[first + 1u + 2u * channel];
+        let texel = way.x * SLOTS + channel;
+        let node = textureLoad(nodes, vec2u(texel % NODE_ROW, texel / NODE_ROW), 0);
+        entry = node.y;
         mark_used(channel, entry);
         if entry == MISSING {
-            mark_missed(channel, level, above(place, wanted, level));
-            here.entry = MISSING;
+            lose(channel, level, place >> (down - wanted_down));
             break;
         }
-        here = Spot(entry, level, above(place, wanted, level), 0.0);
-        if is_range_hidden(channel, index[first + 2u + 2u * channel]) {
-            here.entry = EMPTY;
+        if is_range_hidden(channel, node.z) {
+            entry = EMPTY;
             break;
         }
         if level == wanted {
             break;
         }
-        let children = index[first];
-        if children == 0u {
+        level -= 1u;
+        let bits = down - down_of(level);
+        down -= bits;
+        let child = place >> (down - wanted_down);
+        if node.x == 0u {
             // What is needed below is not there: the lower resolution ends the ray's search.
-            mark_missed(channel, level - 1u, above(place, wanted, level - 1u));
-            here.entry = MISSING;
+            lose(channel, level, child);
+            entry = MISSING;
             break;
         }
-        let bits = frame.levels[level].down - frame.levels[level - 1u].down;
-        let at = above(place, wanted, level - 1u) & ((vec3u(1u) << bits) - 1u);
-        level -= 1u;
-        node = children + at.x + (at.y << bits.x) + (at.z << (bits.x + bits.y));
+        let at = child & ((vec3u(1u) << bits) - 1u);
+        way = vec4u(node.x + at.x + (at.y << bits.x) + (at.z << (bits.x + bits.y)), way.xyz);
+        ways = min(ways + 1u, STACK);
     }
-    last_brick[channel] = here.brick;
-    last_level[channel] = here.level + 1u;
-    here.leaving = leaving_box(here.level, here.brick, 1u, ray);
-    return here;
+    let span = down - wanted_down;
+    if STACK > 0u {
+        stack[channel] = way;
+        held[channel] = ways;
+        last_level[channel] = level;
+        last_brick[channel] = place >> span;
+    }
+    return Spot(entry, place, leaving_box(place, span));
 }

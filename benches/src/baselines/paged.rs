@@ -38,8 +38,8 @@ pub(crate) struct Paged {
     volume: Arc<Volume>,
     tables: PageTables,
     channels: usize,
-    directory: Vec<u32>,
-    blocks: Vec<u32>,
+    pub(crate) directory: Vec<u32>,
+    pub(crate) blocks: Vec<u32>,
     nodes: Vec<Node>,
     start_level: u32,
     /// Smallest and largest value by slot.
@@ -166,21 +166,25 @@ impl Paged {
         node
     }
 
-    /// The page directory and the page tables, or nodes and nothing.
-    pub(crate) fn words(&self, first_level: u32) -> [Vec<u32>; 2] {
+    /// Whether bricks are nodes.
+    pub(crate) fn is_octree(&self) -> bool {
+        self.octree
+    }
+
+    /// Nodes, where bricks are: per node and channel the first child, the brick's entry, and between which values everything is.
+    pub(crate) fn nodes(&self, first_level: u32) -> Option<Vec<[u32; 4]>> {
         if !self.octree {
-            return [self.directory.clone(), self.blocks.clone()];
+            return None;
         }
         let ranges = self.subtree_ranges(first_level);
-        let mut words = Vec::with_capacity(self.nodes.len() * (1 + 2 * self.channels));
-        for (node, ranges) in self.nodes.iter().zip(&ranges) {
-            words.push(node.children);
-            for (entry, range) in node.entries.iter().zip(ranges) {
+        let of_nodes = self.nodes.iter().zip(&ranges).flat_map(|(node, ranges)| {
+            node.entries.iter().zip(ranges).map(|(entry, range)| {
                 let [low, high] = range.unwrap_or([0, u16::MAX]);
-                words.extend([*entry, u32::from(low) | u32::from(high) << 16]);
-            }
-        }
-        [words, Vec::new()]
+                let range = u32::from(low) | u32::from(high) << 16;
+                [node.children, *entry, range, 0]
+            })
+        });
+        Some(of_nodes.collect())
     }
 
     /// Between which values everything in a node is, down to the finest level that is drawn; `None` where

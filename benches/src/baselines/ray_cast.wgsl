@@ -11,6 +11,7 @@
 const EDGE = 32.0;
 const STORED_EDGE = 34u;
 const TABLE_LEN = 256u;
+const LOG2_E = 1.4426950408889634;
 const TERMINATION = 0.000244140625;
 const SEGMENTS_PER_DOUBLING = 8192u;
 const MAX_LEVELS = 32u;
@@ -33,13 +34,11 @@ struct Level {
     eye: vec3f,           // [voxels of the level]
     directory_base: u32,
     voxels_per_nm: vec3f,
-    pad_0: u32,
+    down: u32,            // level-0 voxels per voxel [log2], a byte per axis
     bricks: vec3u,
-    pad_1: u32,
+    pad_0: u32,
     directory: vec3u,     // entries of the page directory per axis
-    pad_2: u32,
-    down: vec3u,          // level-0 voxels per voxel [log2]
-    pad_3: u32,
+    pad_1: u32,
 }
 
 struct Frame {
@@ -66,22 +65,83 @@ struct Frame {
 @group(0) @binding(0) var<uniform> frame: Frame;
 // Counters; a bit per slot in use; a bit per miss that was seen, by hash; misses in pairs of words.
 @group(0) @binding(1) var<storage, read_write> report: array<atomic<u32>>;
-// Per channel: linear RGB and extinction; entries below an index that are not transparent.
-@group(0) @binding(2) var<storage, read> colors: array<vec4f>;
-@group(0) @binding(3) var<storage, read> opaque_before: array<u32>;
+// Per channel a row: linear RGB and extinction; entries below an index that are not transparent. Textures, as the
+// product's: drivers that draw on the CPU read a buffer value by value.
+@group(0) @binding(2) var colors: texture_2d<f32>;
+@group(0) @binding(3) var opaque_before: texture_2d<u32>;
 // Smallest and largest value of each slot.
 @group(0) @binding(4) var<storage, read> ranges: array<u32>;
 @group(0) @binding(5) var bricks: texture_3d<f32>;
 @group(0) @binding(6) var trilinear: sampler;
 @group(0) @binding(7) var image: texture_storage_2d<rgba8unorm, write>;
-// The page directory and page tables, or nodes.
-@group(0) @binding(8) var<storage, read> index: array<u32>;
-@group(0) @binding(9) var<storage, read> blocks: array<u32>;
 
-// What a baseline finds for a place: a brick, or how far there is none.
+// What the frame says of all rays alike, read before they part, as the product does.
+struct Steady {
+    level_count: u32,
+    first_level: u32,
+    last_level: u32,
+    directory_entries: u32,
+    start_level: u32,
+    start_bricks: vec3u, // per axis, of the start level
+    brick_grid: vec3f,
+    texel: vec3f,        // of the brick cache
+    largest: f32,
+    table: vec2f,        // of the only channel
+}
+
+var<private> steady: Steady;
+
+fn read_steady() {
+    let slots = vec3f(frame.brick_grid);
+    steady = Steady(
+        frame.level_count,
+        frame.first_level,
+        frame.last_level,
+        frame.directory_entries,
+        frame.start_level,
+        frame.levels[frame.start_level].bricks,
+        slots,
+        1.0 / (slots * f32(STORED_EDGE)),
+        frame.largest,
+        frame.table[0].xy,
+    );
+}
+
+// A level as a ray meets it, read where the level changes.
+struct Grid {
+    level: u32,
+    eye: vec3f,
+    voxels: vec3f,  // along the ray, per depth
+    inverse: vec3f, // depth per voxel along each axis
+    last: vec3f,    // brick
+    bricks: vec3u,
+    directory: vec3u,
+    directory_base: u32,
+    down: u32,
+}
+
+// Of the level that is wanted.
+var<private> grid: Grid;
+
+fn grid_of(level: u32, ray: vec3f) -> Grid {
+    let here = frame.levels[level];
+    let voxels = ray * here.voxels_per_nm;
+    return Grid(
+        level,
+        here.eye,
+        voxels,
+        1.0 / divisible(voxels),
+        vec3f(here.bricks - 1u),
+        here.bricks,
+        here.directory,
+        here.directory_base,
+        here.down,
+    );
+}
+
+// What a baseline finds for a place: a brick of the wanted level, or how far there is none.
 struct Spot {
     entry: u32,
-    level: u32,
     brick: vec3u,
     leaving: f32, // depth
 }
@@ -90,22 +150,30 @@ struct Spot {
 var<private> work: u32;
 var<private> samples: u32;
 
+// Channels of which the place last looked for is not there, as bits, and the brick of each that is missing.
+var<private> lost: u32;
+var<private> lost_level: array<u32, SLOTS>;
+var<private> lost_brick: array<vec3u, SLOTS>;
+
 fn divisible(v: vec3f) -> vec3f {
     return select(v, select(vec3f(-1e-20), vec3f(1e-20), v >= vec3f(0.0)), abs(v) < vec3f(1e-20));
 }
 
-fn brick_at(level: u32, depth: f32, ray: vec3f) -> vec3u {
-    let at = frame.levels[level].eye + depth * ray * frame.levels[level].voxels_per_nm;
-    let last = vec3f(frame.levels[level].bricks - 1u);
-    return vec3u(clamp(floor(at / EDGE), vec3f(0.0), last));
+// A number per axis, from a byte each.
+fn axes(bytes: u32) -> vec3u {
+    return vec3u(bytes & 255u, (bytes >> 8u) & 255u, bytes >> 16u);
 }
 
-// Depth at which a ray leaves a box of `edge` bricks whose lowest brick is `first`.
-fn leaving_box(level: u32, first: vec3u, edge: u32, ray: vec3f) -> f32 {
-    let low = vec3f(first) * EDGE;
-    let bound = select(low, low + f32(edge) * EDGE, ray >= vec3f(0.0));
-    let voxels = divisible(ray * frame.levels[level].voxels_per_nm);
-    let depths = (bound - frame.levels[level].eye) / voxels;
+fn brick_at(depth: f32) -> vec3u {
+    let at = grid.eye + depth * grid.voxels;
+    return vec3u(clamp(floor(at / EDGE), vec3f(0.0), grid.last));
+}
+
+// Depth at which a ray leaves a box of `1 << span` bricks per axis, which a brick is in.
+fn leaving_box(brick: vec3u, span: vec3u) -> f32 {
+    let low = vec3f((brick >> span) << span) * EDGE;
+    let bound = select(low, low + EDGE * vec3f(vec3u(1u) << span), grid.voxels >= vec3f(0.0));
+    let depths = (bound - grid.eye) * grid.inverse;
     return min(depths.x, min(depths.y, depths.z));
 }
 
@@ -123,6 +191,13 @@ fn mark_used(channel: u32, entry: u32) {
     if (atomicLoad(&report[word]) & bit) == 0u {
         atomicOr(&report[word], bit);
     }
+}
+
+// To be reported when the ray has ended, which it does here.
+fn lose(channel: u32, level: u32, brick: vec3u) {
+    lost |= 1u << channel;
+    lost_level[channel] = level;
+    lost_brick[channel] = brick;
 }
 
 fn mark_missed(channel: u32, level: u32, brick: vec3u) {
@@ -143,7 +218,10 @@ fn mark_missed(channel: u32, level: u32, brick: vec3u) {
 }
 
 fn table_position(channel: u32, stored: f32) -> f32 {
-    let scaled = frame.table[channel];
+    var scaled = steady.table;
+    if SLOTS > 1u {
+        scaled = frame.table[channel].xy;
+    }
     return clamp(stored * scaled.x + scaled.y, 0.0, f32(TABLE_LEN - 1u));
 }
 
@@ -151,18 +229,18 @@ fn is_range_hidden(channel: u32, range: u32) -> bool {
     let high = range >> 16u;
     let first = u32(table_position(channel, f32(range & 0xffffu)));
     let last = u32(ceil(table_position(channel, f32(high))));
-    let before = channel * (TABLE_LEN + 1u);
-    return high == 0u || opaque_before[before + last + 1u] == opaque_before[before + first];
+    let before = textureLoad(opaque_before, vec2u(first, channel), 0).r;
+    let behind = textureLoad(opaque_before, vec2u(last + 1u, channel), 0).r;
+    return high == 0u || behind == before;
 }
 
 fn color_of(channel: u32, stored: f32) -> vec4f {
-    if stored <= 0.0 {
-        return vec4f(0.0);
-    }
-    let x = table_position(channel, stored * frame.largest);
+    let x = table_position(channel, stored * steady.largest);
     let i = min(u32(x), TABLE_LEN - 2u);
-    let at = channel * TABLE_LEN + i;
-    return mix(colors[at], colors[at + 1u], x - f32(i));
+    let low = textureLoad(colors, vec2u(i, channel), 0);
+    let high = textureLoad(colors, vec2u(i + 1u, channel), 0);
+    let color = mix(low, high, x - f32(i));
+    return vec4f(color.rgb, select(0.0, color.a, stored > 0.0));
 }
 
 fn projected_size(edges: vec3f, direction: vec3f) -> f32 {
@@ -170,7 +248,7 @@ fn projected_size(edges: vec3f, direction: vec3f) -> f32 {
 }
 
 fn depth_of_next(level: u32, ray: vec3f) -> f32 {
-    if level + 1u >= frame.level_count {
+    if level + 1u >= steady.level_count {
         return 3e38;
     }
     let here = projected_size(1.0 / frame.levels[level].voxels_per_nm, ray);
@@ -184,30 +262,41 @@ fn encoded(linear: vec3f) -> vec3f {
 }
 
 var<private> drawn: array<Spot, SLOTS>;
-var<private> drawn_for: array<u32, SLOTS>;
-// Texels: the brick's low corner, the first sample from there, and the way to the next per depth.
-var<private> corner: array<vec3f, SLOTS>;
-var<private> from_corner: array<vec3f, SLOTS>;
-var<private> per_depth: array<vec3f, SLOTS>;
+// As the sampler counts: the first sample. The way to the next per depth is the same in all bricks.
+var<private> first_texel: array<vec3f, SLOTS>;
+var<private> texels_per_depth: vec3f;
 
-fn aim(channel: u32, depth: f32, ray: vec3f) {
+// f32 places samples of what is measured well enough that none leaves the border of its brick.
+fn aim(channel: u32, depth: f32) {
     let here = drawn[channel];
-    let slot = here.entry - FIRST_SLOT;
-    let grid = frame.brick_grid;
-    let cell = vec3u(slot % grid.x, slot / grid.x % grid.y, slot / (grid.x * grid.y));
-    let voxels = ray * frame.levels[here.level].voxels_per_nm;
-    corner[channel] = vec3f(cell * STORED_EDGE + 1u);
-    from_corner[channel] = frame.levels[here.level].eye - vec3f(here.brick) * EDGE + depth * voxels;
-    per_depth[channel] = voxels;
+    let across = steady.brick_grid;
+    // Whole numbers below 2^22: exact, and quicker than dividing integers.
+    let slot = f32(here.entry - FIRST_SLOT) + 0.5;
+    let row = floor(slot / across.x);
+    let layer = floor(slot / (across.x * across.y));
+    let cell = vec3f(floor(slot) - row * across.x, row - layer * across.y, layer);
+    let corner = cell * f32(STORED_EDGE) + 1.0;
+    let inside = grid.eye - vec3f(here.brick) * EDGE + depth * grid.voxels;
+    first_texel[channel] = (corner + inside) * steady.texel;
 }
 
-fn stored_at(channel: u32, ahead: f32) -> f32 {
-    let at = clamp(from_corner[channel] + ahead * per_depth[channel], vec3f(0.0), vec3f(EDGE));
-    let texel = 1.0 / vec3f(frame.brick_grid * STORED_EDGE);
-    return textureSampleLevel(bricks, trilinear, (corner[channel] + at) * texel, 0.0).r;
+fn sampled_at(channel: u32, ahead: f32) -> vec4f {
+    let at = first_texel[channel] + ahead * texels_per_depth;
+    return color_of(channel, textureSampleLevel(bricks, trilinear, at, 0.0).r);
 }
 
-fn trace(pixel: vec2u) -> vec3f {
+// Loops over channels take as many turns as a ray needs.
+fn count_of(channels: u32) -> u32 {
+    return select(countOneBits(channels), 1u, SLOTS == 1u);
+}
+
+fn lowest_of(channels: u32) -> u32 {
+    return select(firstTrailingBit(channels), 0u, SLOTS == 1u);
+}
+
+// Loops, from the outside: stretches of one level and step; bricks, or samples where each is searched for; samples. Drivers
+// that draw on the CPU run all of what is not in a loop further inside for each.
+fn trace(pixel: vec2u, inside: bool) -> vec3f {
     let from_middle = (vec2f(pixel) + 0.5) / vec2f(frame.size) * 2.0 - 1.0;
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
     let nm_per_depth = length(ray);
@@ -223,72 +312,104 @@ fn trace(pixel: vec2u) -> vec3f {
     var level = 0u;
     var level_end = -1.0;
     var segments = 0u;
-    var misses = 0u;
     // Channels that are drawn from here on, as bits.
     var sampled = 0u;
-    for (var c = 0u; c < SLOTS; c += 1u) {
-        drawn_for[c] = MAX_LEVELS;
-    }
-    if frame.counting == 1u && start < end {
-        atomicAdd(&report[COUNT_RAYS], 1u);
-    }
-    let meets = start < end;
-    while start < end && transmitted > TERMINATION && misses == 0u {
-        while start >= level_end {
+    let meets = inside && start < end;
+    var going = meets;
+    while going {
+        loop {
+            if start < level_end {
+                break;
+            }
             if level_end >= 0.0 {
                 level += 1u;
             }
             level_end = depth_of_next(level, ray);
         }
-        let wanted = clamp(level, frame.first_level, frame.last_level);
-        let voxels_per_depth = length(ray * frame.levels[wanted].voxels_per_nm);
+        let wanted = clamp(level, steady.first_level, steady.last_level);
+        if wanted != grid.level {
+            for (var c = 0u; c < SLOTS; c += 1u) {
+                drawn[c].leaving = -1.0;
+            }
+        }
+        grid = grid_of(wanted, ray);
+        texels_per_depth = grid.voxels * steady.texel;
         let doublings = min(segments / SEGMENTS_PER_DOUBLING, 64u);
-        let step = 0.5 / voxels_per_depth * exp2(f32(doublings));
-        let first = min(step, end - start);
-        let depth = start + 0.5 * first;
-        var until = min(level_end + 0.5 * step, end + 0.5 * step);
-        let was_sampled = sampled != 0u;
-        sampled = 0u;
-        for (var c = 0u; c < SLOTS; c += 1u) {
-            if (EACH_SAMPLE && was_sampled) || wanted != drawn_for[c] || depth >= drawn[c].leaving {
-                drawn[c] = find(c, wanted, depth, ray);
-                drawn_for[c] = wanted;
-                misses += u32(drawn[c].entry == MISSING);
+        let step = 0.5 / length(grid.voxels) * exp2(f32(doublings));
+        // Level and step hold up to here.
+        let stretch = min(level_end, end);
+        let doubling = (segments / SEGMENTS_PER_DOUBLING + 1u) * SEGMENTS_PER_DOUBLING;
+        loop {
+            let first = min(step, end - start);
+            let depth = start + 0.5 * first;
+            var until = stretch + 0.5 * step;
+            // Channels to search for.
+            var due = 0u;
+            for (var c = 0u; c < SLOTS; c += 1u) {
+                let holds = depth < drawn[c].leaving && !(EACH_SAMPLE && sampled != 0u);
+                due |= select(1u << c, 0u, holds);
             }
-            until = min(until, drawn[c].leaving);
-            sampled |= select(0u, 1u << c, drawn[c].entry >= FIRST_SLOT);
-        }
-        let ahead_of_all = u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
-        let count = select(ahead_of_all, 1u, EACH_SAMPLE && sampled != 0u);
-        for (var c = 0u; c < SLOTS; c += 1u) {
-            if (sampled & (1u << c)) != 0u {
-                aim(c, depth, ray);
+            for (var n = countOneBits(due); n > 0u; n -= 1u) {
+                let c = lowest_of(due);
+                due &= due - 1u;
+                drawn[c] = find(c, depth);
             }
-        }
-        if sampled != 0u {
-            for (var i = 0u; i < count && transmitted > TERMINATION; i += 1u) {
-                let segment = min(step, end - start - f32(i) * step);
-                let ahead = f32(i) * step + 0.5 * (segment - first);
-                var sum = vec4f(0.0);
-                for (var c = 0u; c < SLOTS; c += 1u) {
-                    if (sampled & (1u << c)) == 0u {
-                        continue;
+            sampled = 0u;
+            for (var c = 0u; c < SLOTS; c += 1u) {
+                until = min(until, drawn[c].leaving);
+                sampled |= select(0u, 1u << c, drawn[c].entry >= FIRST_SLOT);
+            }
+            let ahead_of_all = u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
+            var count = select(ahead_of_all, 1u, EACH_SAMPLE && sampled != 0u);
+            // The last segment, which is cut where the ray leaves the volume, goes alone.
+            count = min(count, max(u32((end - start) / step), 1u));
+            var rest = sampled;
+            for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
+                aim(lowest_of(rest), depth);
+                rest &= rest - 1u;
+            }
+            let halvings = -LOG2_E * first * nm_per_depth;
+            var i = 0.0;
+            if sampled != 0u {
+                loop {
+                    let ahead = i * step;
+                    var sum = vec4f(0.0);
+                    if SLOTS == 1u {
+                        sum = sampled_at(0u, ahead);
+                    } else {
+                        var rest = sampled;
+                        for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
+                            let color = sampled_at(firstTrailingBit(rest), ahead);
+                            rest &= rest - 1u;
+                            sum += vec4f(color.a * color.rgb, color.a);
+                        }
                     }
-                    samples += 1u;
-                    let color = color_of(c, stored_at(c, ahead));
-                    sum += vec4f(color.a * color.rgb, color.a);
-                }
-                if sum.a > 0.0 {
-                    let opacity = 1.0 - exp(-sum.a * max(segment, 0.0) * nm_per_depth);
-                    light += transmitted * opacity * sum.rgb / sum.a;
-                    transmitted *= 1.0 - opacity;
+                    let through = transmitted * exp2(sum.a * halvings);
+                    let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
+                    light += (transmitted - through) * share * sum.rgb;
+                    transmitted = through;
+                    i += 1.0;
+                    continuing {
+                        break if i >= f32(count) || transmitted <= TERMINATION;
+                    }
                 }
             }
+            samples += u32(i) * countOneBits(sampled);
+            start += f32(count) * step;
+            segments += count;
+            continuing {
+                going = start < end && transmitted > TERMINATION && lost == 0u;
+                break if !going || start >= stretch || segments >= doubling;
+            }
         }
-        start += f32(count) * step;
-        segments += count;
+    }
+    for (var n = countOneBits(lost); n > 0u; n -= 1u) {
+        let c = lowest_of(lost);
+        lost &= lost - 1u;
+        mark_missed(c, lost_level[c], lost_brick[c]);
     }
     if frame.counting == 1u && meets {
+        atomicAdd(&report[COUNT_RAYS], 1u);
         add(COUNT_SAMPLES, samples);
         add(COUNT_WORK, work);
         atomicMax(&report[MOST_WORK], work);
@@ -306,8 +427,17 @@ fn add(counter: u32, count: u32) {
 }
 
 @compute @workgroup_size(8, 8)
-fn main(@builtin(global_invocation_id) id: vec3u) {
-    if all(id.xy < frame.size) {
-        textureStore(image, id.xy, vec4f(encoded(trace(id.xy)), 1.0));
+fn main(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+    // Neighbours in both directions are drawn together, as the product's.
+    let within = vec2u(
+        (local & 3u) | ((local >> 1u) & 4u),
+        ((local >> 2u) & 1u) | ((local >> 3u) & 6u),
+    );
+    read_steady();
+    let pixel = group.xy * 8u + within;
+    let inside = all(pixel < frame.size);
+    let light = trace(pixel, inside);
+    if inside {
+        textureStore(image, pixel, vec4f(encoded(light), 1.0));
     }
 }
