@@ -297,6 +297,16 @@ pub enum CatalogError {
         /// Where it is.
         location: CatalogLocation,
     },
+    /// An older copy of the catalog was copied over its file while that was open.
+    #[error(
+        "an older copy of the catalog was copied over its file while it was in use, and nothing more is written, for the two \
+         would mix. Stop all programs that use it, remove the -wal and -shm beside it, put the copy in its place once more, and \
+         start again: `saccade ingest` takes in what the copy lacks: {location}"
+    )]
+    Older {
+        /// Where it is.
+        location: CatalogLocation,
+    },
     /// A table of the catalog's is not there.
     #[error(
         "the catalog has no table {table:?}{}: it was damaged, or changed by another program. Put a copy of the catalog in its \
@@ -419,6 +429,7 @@ impl CatalogError {
             | Self::Moved { location }
             | Self::Away { location, .. }
             | Self::Another { location }
+            | Self::Older { location }
             | Self::NoTable { location, .. }
             | Self::SpoiltVolume { location, .. }
             | Self::SpoiltTile { location, .. }

@@ -41,6 +41,19 @@ impl Owner {
     }
 }
 
+/// What is known of the file that has the open one's name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum File {
+    /// It looks as it did when it was last known to be the right one, or nobody asks.
+    Unchanged,
+    /// It is the archive's.
+    Right,
+    /// It is another archive's.
+    Another,
+    /// It is the archive's, and lacks what was in it before.
+    Older,
+}
+
 impl Inner {
     /// Looks whose the catalog is that is there now, and tells those who wait if that is news. Whether it is the right one.
     pub(super) async fn look_whose(&self) -> Result<bool, sqlx::Error> {
@@ -51,15 +64,37 @@ impl Inner {
         self.note_whose(&rows)
     }
 
-    /// A file can be copied over the open one. Connections that are open do not notice; a new one does. `None` if the file
-    /// looks as it did when it was last known whose it is.
-    pub(super) async fn look_whose_afresh(&self) -> Result<Option<bool>, sqlx::Error> {
+    /// A file can be copied over the open one. Connections that are open do not notice.
+    pub(super) async fn look_at_file(&self) -> Result<File, sqlx::Error> {
         let (Database::Sqlite(file), Some(_)) = (&self.database, self.owner.identity.get()) else {
-            return Ok(None);
+            return Ok(File::Unchanged);
         };
         let Some(stamp) = file.new_stamp() else {
-            return Ok(None);
+            return Ok(File::Unchanged);
         };
+        let alone = file.alone(stamp).await;
+        if let Some(alone) = &alone
+            && file.is_older(alone)
+            // What was read while the log was moved to the file may be half of this and half of that.
+            && file.alone(stamp).await.as_ref() == Some(alone)
+        {
+            return Ok(File::Older);
+        }
+        let found = match &alone {
+            Some(alone) if alone.identity.is_some() => alone.identity.clone(),
+            _ => self.whose_afresh(file).await?,
+        };
+        if self.owner.is(found.as_deref()) {
+            file.keep(stamp, alone);
+            Ok(File::Right)
+        } else {
+            self.note_right(false);
+            Ok(File::Another)
+        }
+    }
+
+    /// By a new connection, which sees what those that are open do not.
+    async fn whose_afresh(&self, file: &sqlite::Opened) -> Result<Option<String>, sqlx::Error> {
         let access = match file.reading() {
             sqlite::Access::Write => sqlite::Access::Read,
             reading => reading,
@@ -67,15 +102,9 @@ impl Inner {
         let options = sqlite::options(&file.path, access);
         let mut connection = options.connect().await?;
         let found = sqlx::query_scalar(WHOSE).fetch_optional(&mut connection);
-        let found: Option<String> = found.await?;
+        let found = found.await?;
         connection.close().await?;
-        let right = self.owner.is(found.as_deref());
-        if right {
-            file.keep_stamp(stamp);
-        } else {
-            self.note_right(false);
-        }
-        Ok(Some(right))
+        Ok(found)
     }
 
     /// By the answer to [`WHOSE`].
@@ -163,8 +192,11 @@ impl Catalog {
 
     /// A file that was copied over the open one is refused.
     pub(super) async fn refuse_copied_over(&self) -> Result<(), CatalogError> {
-        match self.inner.look_whose_afresh().await {
-            Ok(found) => self.or_another(Ok(found != Some(false))),
+        match self.inner.look_at_file().await {
+            Ok(File::Older) => Err(CatalogError::Older {
+                location: self.location().clone(),
+            }),
+            Ok(found) => self.or_another(Ok(found != File::Another)),
             // It may have gone just now.
             Err(e) => self.look_for_file().and(Err(self.failed(e))),
         }

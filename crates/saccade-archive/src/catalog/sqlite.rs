@@ -6,7 +6,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::atomic::{AtomicBool, AtomicU32};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use sqlx::migrate::{MigrateError, Migrator};
@@ -16,8 +16,10 @@ use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 use super::CatalogError;
 use crate::clock::{Clock as _, SystemClock};
 
+mod alone;
 mod replaced;
 
+pub(super) use alone::Alone;
 use replaced::Replaced;
 pub(super) use replaced::{Away, Place};
 
@@ -77,12 +79,19 @@ pub(super) struct Opened {
     logged: AtomicU32,
     /// Why nothing may be written any more: a sync failed.
     stopped: OnceLock<String>,
-    /// What the file looked like when it was last known whose it is.
-    stamp: Mutex<Option<Stamp>>,
+    /// What the file looked like, and had, when it was last known whose it is.
+    known: Mutex<Known>,
 }
 
 /// Length, and when it was written.
 pub(super) type Stamp = (u64, SystemTime);
+
+/// A file as it was when it was last known to be the right one.
+#[derive(Debug, Default)]
+struct Known {
+    stamp: Option<Stamp>,
+    alone: Alone,
+}
 
 /// Transactions in the write-ahead log from which on it is emptied: some megabytes.
 const MOST_LOGGED: u32 = 100;
@@ -100,7 +109,7 @@ impl Opened {
             // What is there from before is not known.
             logged: AtomicU32::new(MOST_LOGGED),
             stopped: OnceLock::new(),
-            stamp: Mutex::default(),
+            known: Mutex::default(),
         }
     }
 
@@ -117,16 +126,42 @@ impl Opened {
     /// What the file looks like, if that is not as it was kept: what was in the log was moved to it, or another
     /// was copied over it.
     pub(super) fn new_stamp(&self) -> Option<Stamp> {
-        let meta = std::fs::metadata(&self.path).ok()?;
-        let now = (meta.len(), meta.modified().ok()?);
-        let kept = self.stamp.lock().unwrap_or_else(PoisonError::into_inner);
-        (*kept != Some(now)).then_some(now)
+        let now = self.stamp()?;
+        (self.known().stamp != Some(now)).then_some(now)
     }
 
-    /// The file that looks so is known.
-    pub(super) fn keep_stamp(&self, stamp: Stamp) {
-        let mut kept = self.stamp.lock().unwrap_or_else(PoisonError::into_inner);
-        *kept = Some(stamp);
+    fn stamp(&self) -> Option<Stamp> {
+        let meta = std::fs::metadata(&self.path).ok()?;
+        Some((meta.len(), meta.modified().ok()?))
+    }
+
+    /// The file that looks so, and has that if it could be read, is the right one.
+    pub(super) fn keep(&self, stamp: Stamp, alone: Option<Alone>) {
+        let mut known = self.known();
+        known.stamp = Some(stamp);
+        if let Some(alone) = alone {
+            known.alone = alone;
+        }
+    }
+
+    /// What the file itself has that looks so; `None` if it cannot be told now.
+    pub(super) async fn alone(&self, stamp: Stamp) -> Option<Alone> {
+        let alone = Alone::read(&self.path).await.ok()?;
+        (self.stamp() == Some(stamp)).then_some(alone)
+    }
+
+    /// Whether that is what the file had at an earlier time.
+    pub(super) fn is_older(&self, alone: &Alone) -> bool {
+        alone.is_older_than(&self.known().alone)
+    }
+
+    /// Another file has its place.
+    fn forget(&self) {
+        *self.known() = Known::default();
+    }
+
+    fn known(&self) -> MutexGuard<'_, Known> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether the name is another file's by now, or nobody's. A disk that cannot be asked tells by itself.

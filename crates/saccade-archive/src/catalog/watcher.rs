@@ -10,6 +10,7 @@ use sqlx::{ConnectOptions, Connection as _, PgPool, SqliteConnection};
 use tokio::sync::watch;
 
 use super::database::Database;
+use super::identity::File;
 use super::sqlite::{Away, Place};
 use super::{CatalogError, Inner, postgres, rows, sqlite};
 use crate::clock::{Clock as _, SystemClock};
@@ -262,14 +263,21 @@ async fn look(
     seen: &mut Option<i64>,
 ) -> Result<(), CatalogError> {
     let failed = |e| CatalogError::sort(e, &catalog.location);
-    match catalog.look_whose_afresh().await.map_err(failed)? {
-        Some(false) => return Ok(()),
+    match catalog.look_at_file().await.map_err(failed)? {
+        File::Another => return Ok(()),
         // What is open knows nothing of what was copied over it.
-        Some(true) if catalog.owner.is_another() => {
+        File::Right if catalog.owner.is_another() => {
             *connection = None;
             file.open_again().await?;
         }
-        Some(true) | None => {}
+        File::Older => {
+            let location = catalog.location.clone();
+            log::warn!("{}", CatalogError::Older { location });
+            *connection = None;
+            file.open_again().await?;
+            catalog.watcher.begin_anew();
+        }
+        File::Right | File::Unchanged => {}
     }
     let connection = match connection {
         Some(connection) => connection,

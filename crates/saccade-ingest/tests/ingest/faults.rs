@@ -310,6 +310,54 @@ async fn a_catalog_that_is_taken_away_ends_it() {
     assert_eq!(seen(&archive).await.len(), 2);
 }
 
+/// What is acknowledged afterwards would be lost, or mixed with what the copy has.
+#[tokio::test]
+async fn an_older_copy_over_the_catalog_ends_it() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let [file, copy] = ["catalog.sqlite", "copy"].map(|name| folder.path().join(name));
+    let taken_in = async |tile: u8| {
+        let archive = archive(folder.path()).await;
+        scope.tile(&format!("t{tile}"), tile.into(), SIZE, tile);
+        scope.ingest(&archive).await;
+        // Nothing is left in its log.
+        archive.catalog().close().await;
+    };
+    taken_in(0).await;
+    fs::copy(&file, &copy).unwrap();
+    taken_in(1).await;
+    let archive = archive(folder.path()).await;
+    scope.tile("t2", 2, SIZE, 2);
+    let options = IngestOptions {
+        once: false,
+        ..quick()
+    };
+    let (cancel, diary) = (Cancel::new(), Diary::default());
+    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
+    let replace = async {
+        while diary.states().last().is_none_or(|state| state.tiles < 1) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        fs::copy(&copy, &file).unwrap();
+        scope.tile("t3", 3, SIZE, 3);
+    };
+    let both = async { tokio::join!(ingest, replace) };
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+    let ended = both.expect("it ends").0.unwrap_err();
+    assert!(
+        matches!(ended, IngestError::Catalog(CatalogError::Older { .. })),
+        "{ended}"
+    );
+    archive.catalog().close().await;
+    // As the message says.
+    for beside in ["-wal", "-shm"] {
+        let _what_is_there = fs::remove_file(format!("{}{beside}", file.display()));
+    }
+    fs::copy(&copy, &file).unwrap();
+    let archive = crate::scope::archive(folder.path()).await;
+    scope.ingest(&archive).await;
+    assert_eq!(seen(&archive).await.len(), 4);
+}
+
 #[tokio::test]
 async fn a_write_that_fails_is_repeated() {
     let bench = Bench::new().await;

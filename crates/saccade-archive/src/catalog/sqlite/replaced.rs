@@ -127,6 +127,7 @@ impl Opened {
             newer.readers.close().await;
         }
         *lock(&self.replaced.newer) = Some(Box::new(newer));
+        self.forget();
         self.replaced.times.fetch_add(1, Release);
         Ok(())
     }
@@ -151,7 +152,9 @@ mod tests {
     use glam::{DVec3, UVec2, UVec3};
     use saccade_core::transform::SectionFromTile;
     use saccade_core::volume::Volume;
+    use sqlx::ConnectOptions as _;
 
+    use super::super::options;
     use super::*;
     use crate::catalog::{Catalog, NewTile};
 
@@ -330,6 +333,82 @@ mod tests {
         let tiles = until(async || catalog.entry("v").await.ok().map(|entry| entry.tiles));
         assert_eq!(tiles.await, 3);
         assert!(catalog.times_replaced() > 0, "anything may be another");
+    }
+
+    #[tokio::test]
+    async fn what_is_in_the_log_does_not_hide_whose_file_was_copied_over_the_open_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, other] = ["catalog.sqlite", "other"].map(|name| folder.path().join(name));
+        of_two_archives(&path, &other).await.close().await;
+        let identity = "c".repeat(32);
+        let catalog = Catalog::open(path.as_path()).await.unwrap();
+        let mut connection = options(&path, Access::Write).connect().await.unwrap();
+        sqlx::query("UPDATE archive SET identity = $1")
+            .bind(&identity)
+            .execute(&mut connection)
+            .await
+            .unwrap();
+        catalog.belongs_to(&identity);
+        catalog.verify().await.unwrap();
+        std::fs::copy(&other, &path).unwrap();
+        let refused = catalog.delete_tile("v", "0", 9).await.unwrap_err();
+        assert!(matches!(refused, CatalogError::Another { .. }), "{refused}");
+    }
+
+    /// A catalog that is followed, of which there is a copy, after which three tiles were deleted.
+    async fn with_older_copy(path: &Path, copy: &Path) -> Catalog {
+        let (first, other) = (copy.with_extension("first"), copy.with_extension("other"));
+        of_two_archives(&first, &other).await.close().await;
+        std::fs::copy(&first, path).unwrap();
+        std::fs::copy(&first, copy).unwrap();
+        let catalog = Catalog::open(path).await.unwrap();
+        catalog.belongs_to(&"a".repeat(32));
+        for tile in ["0", "1"] {
+            catalog.delete_tile("v", tile, 9).await.unwrap();
+        }
+        // What others write, and move to the file, is the right one's.
+        let another = Catalog::open(path).await.unwrap();
+        another.delete_tile("v", "2", 9).await.unwrap();
+        let mut connection = options(path, Access::Write).connect().await.unwrap();
+        sqlx::query("PRAGMA wal_checkpoint(FULL)")
+            .execute(&mut connection)
+            .await
+            .unwrap();
+        let none = catalog.delete_tile("v", "2", 9).await;
+        none.expect("nobody copied anything");
+        catalog
+    }
+
+    #[tokio::test]
+    async fn nothing_is_written_once_an_older_copy_is_over_the_open_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, copy] = ["catalog.sqlite", "copy"].map(|name| folder.path().join(name));
+        let catalog = with_older_copy(&path, &copy).await;
+        std::fs::copy(&copy, &path).unwrap();
+        for _ in 0..2 {
+            let refused = catalog.delete_tile("v", "0", 9).await.unwrap_err();
+            assert!(matches!(refused, CatalogError::Older { .. }), "{refused}");
+            assert!(!refused.is_transient() && !refused.is_outage());
+        }
+    }
+
+    #[tokio::test]
+    async fn who_reads_goes_on_with_an_older_copy() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, copy] = ["catalog.sqlite", "copy"].map(|name| folder.path().join(name));
+        let catalog = with_older_copy(&path, &copy).await;
+        let mut connection = options(&path, Access::Write).connect().await.unwrap();
+        sqlx::query("PRAGMA wal_checkpoint(TRUNCATE)")
+            .execute(&mut connection)
+            .await
+            .unwrap();
+        catalog.follow();
+        std::fs::copy(&copy, &path).unwrap();
+        until(async || (catalog.times_replaced() == 1).then_some(())).await;
+        let tiles = until(async || catalog.entry("v").await.ok().map(|entry| entry.tiles));
+        assert_eq!(tiles.await, 3);
+        let refused = catalog.delete_tile("v", "0", 9).await.unwrap_err();
+        assert!(matches!(refused, CatalogError::Moved { .. }), "{refused}");
     }
 
     #[tokio::test]
