@@ -381,6 +381,10 @@ impl Check<'_> {
                     self.find(FindingKind::Damaged, entry, Some(tile), reason);
                     return Ok(());
                 }
+                StorageError::NoFile { .. } => {
+                    let reason = "a named pipe, a socket or a device lies in the place of the pyramid, and nothing is read of it";
+                    (FindingKind::Damaged, reason.to_owned())
+                }
                 // One file that the disk cannot read is damaged; a store that is away says nothing.
                 StorageError::Io { source, .. } => {
                     (FindingKind::Damaged, format!("it cannot be read: {source}"))

@@ -11,9 +11,11 @@ use std::time::SystemTime;
 use bytes::Bytes;
 
 mod folder_id;
+mod regular;
 mod simulated;
 
 pub use folder_id::FolderId;
+pub(crate) use regular::open_regular;
 pub use simulated::{Crash, SimulatedDisk};
 
 /// A file system, in steps that a power cut can come between. All block.
@@ -92,7 +94,7 @@ pub trait Disk: Send + Sync + fmt::Debug {
     ///
     /// # Errors
     ///
-    /// What the system says.
+    /// [`io::ErrorKind::NotSeekable`] if it is a named pipe, a socket or a device; what the system says.
     fn read(&self, path: &Path, range: Option<Range<u64>>) -> io::Result<Bytes>;
 }
 
@@ -209,7 +211,7 @@ impl Disk for SystemDisk {
     }
 
     fn remove_if_unlocked(&self, path: &Path) -> io::Result<()> {
-        let file = File::open(path)?;
+        let file = open_regular(path)?;
         if file.try_lock().is_ok() {
             fs::remove_file(path)?;
         }
@@ -249,7 +251,7 @@ impl Disk for SystemDisk {
     }
 
     fn read(&self, path: &Path, range: Option<Range<u64>>) -> io::Result<Bytes> {
-        let mut file = File::open(path)?;
+        let mut file = open_regular(path)?;
         let cut = super::memory::cut(range, file.metadata()?.len());
         let len = cut.end - cut.start;
         file.seek(SeekFrom::Start(cut.start))?;

@@ -26,6 +26,15 @@ pub enum StorageError {
         /// The folder.
         path: String,
     },
+    /// A named pipe, a socket or a device has the name of an object.
+    #[error(
+        "what lies in the place of a file is none, but a named pipe, a socket or a device, of which nothing is read; take it away: \
+         {path}"
+    )]
+    NoFile {
+        /// What is there.
+        path: String,
+    },
     /// The system forbids it.
     #[error(
         "access is denied; check the owner and permissions, and that the disk is not mounted read-only: {path}"
@@ -110,6 +119,7 @@ impl StorageError {
                 Self::Denied { source, path }
             }
             io::ErrorKind::IsADirectory => Self::Occupied { path },
+            io::ErrorKind::NotSeekable => Self::NoFile { path },
             _ => Self::Io { source, path },
         }
     }
@@ -124,6 +134,7 @@ impl StorageError {
             | Self::Refused { path, .. }
             | Self::Unavailable { path, .. }
             | Self::Occupied { path }
+            | Self::NoFile { path }
             | Self::Away { path }
             | Self::Io { path, .. } => text.replace(&format!(": {path}"), ""),
             Self::NotFound { .. } | Self::Name { .. } => text,

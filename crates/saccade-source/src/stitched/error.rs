@@ -146,6 +146,14 @@ impl StitchError {
     pub fn is_transient(&self) -> bool {
         match self {
             Self::Catalog { source } => source.is_transient(),
+            Self::Tile {
+                source:
+                    PyramidError::Storage {
+                        source: StorageError::NoFile { .. },
+                        ..
+                    },
+                ..
+            } => false,
             // A file that is not there may be on its way; the catalog named it.
             Self::Tile { source, .. } => matches!(source, PyramidError::Storage { .. }),
             Self::Missing { .. }

@@ -16,6 +16,7 @@ mod labels;
 mod list_channels;
 mod lists;
 mod no_effect;
+mod no_files;
 #[allow(dead_code, reason = "others use more of it")]
 #[path = "../../../saccade-archive/tests/support/postgres.rs"]
 mod postgres;

@@ -8,6 +8,7 @@ use super::prefix::{HEAD, MAX_LINE, Prefix, read_line};
 use super::{BrokenRecord, Record, parse};
 use crate::acquisition::text::unmarked;
 use crate::acquisition::{AcquisitionError, refuse_link_out};
+use crate::storage::open_regular;
 
 /// How far the records were read, and which.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
@@ -125,7 +126,7 @@ impl RecordReader {
         if let Err(leads_out) = refuse_link_out(&self.path) {
             return Ok(Err(leads_out));
         }
-        let mut file = match File::open(&self.path) {
+        let mut file = match open_regular(&self.path) {
             Ok(file) => file,
             Err(e) if e.kind() == io::ErrorKind::NotFound && offset == 0 => return Ok(Ok(None)),
             Err(e) => return Err(e),

@@ -29,6 +29,37 @@ async fn a_folder_in_the_place_of_a_file_is_said_to_be_one() {
     assert_eq!(fs::read_dir(dir.path().join(INCOMING)).unwrap().count(), 0);
 }
 
+/// Nobody ever writes to the pipe: whoever waited for that would wait for ever.
+#[cfg(unix)]
+#[tokio::test]
+async fn what_is_no_file_is_not_waited_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let make_pipe = |name: &str| {
+        let path = dir.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let made = std::process::Command::new("mkfifo").arg(&path).status();
+        assert!(made.unwrap().success());
+    };
+    make_pipe("tiles/pipe");
+    make_pipe(&format!("{INCOMING}/pipe"));
+    let storage = LocalStorage::new(dir.path()).unwrap();
+    let _socket = std::os::unix::net::UnixListener::bind(dir.path().join("tiles/socket")).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", dir.path().join("tiles/zeros")).unwrap();
+    for name in ["pipe", "socket", "zeros"] {
+        let name = format!("tiles/{name}");
+        for range in [None, Some(3..9)] {
+            let refused = storage.read(&name, range).await.unwrap_err();
+            assert!(matches!(refused, StorageError::NoFile { .. }), "{refused}");
+            assert!(!refused.is_transient(), "{refused}");
+        }
+        storage
+            .write_durable(&name, Bytes::from_static(b"abc"))
+            .await
+            .unwrap();
+        assert_eq!(storage.read(&name, None).await.unwrap(), b"abc"[..]);
+    }
+}
+
 #[tokio::test]
 async fn conforms_on_a_simulated_disk() {
     let storage = LocalStorage::on(Arc::new(SimulatedDisk::new()), "deep/root").unwrap();
