@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
-use saccade_archive::catalog::{CatalogError, Listed};
+use saccade_archive::catalog::{Catalog, CatalogError, Listed};
 use saccade_archive::{
     ArchiveError, ArchiveLocation, CatalogLocation, StorageLocation, VisualizationArchive,
 };
@@ -225,6 +225,8 @@ pub(crate) const NOT_STITCHED: &str = "an image is not stitched, but read as it 
 /// An open volume, and who knows how its acquisition is coming along.
 pub(crate) struct Opened {
     pub(crate) source: Arc<dyn VolumeSource>,
+    /// The catalog, of an archive that is opened here.
+    pub(crate) catalog: Option<Catalog>,
     pub(crate) acquisition: Option<AcquisitionReader>,
 }
 
@@ -285,6 +287,7 @@ impl Place {
                 });
                 Ok(Opened {
                     source: Arc::new(source),
+                    catalog: None,
                     acquisition: Some(acquisition),
                 })
             }
@@ -330,6 +333,7 @@ impl Place {
                 });
                 Ok(Opened {
                     source,
+                    catalog: Some(archive.catalog().clone()),
                     acquisition: Some(acquisition),
                 })
             }
@@ -349,6 +353,7 @@ impl Place {
         }
         Ok(Opened {
             source,
+            catalog: None,
             acquisition: None,
         })
     }

@@ -72,6 +72,57 @@ impl Catalog {
         Ok(rows.into_iter().filter_map(Result::err).collect())
     }
 
+    /// Refuses a volume of which a row says what cannot be, so that its tile is found by nobody who looks for the tiles of a
+    /// place: of a section or channel that the volume has not, of no size, of a section that counts no tiles, or of one that is
+    /// neither there nor deleted as it should be. Looks at all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::SpoiltTile`] of the first, [`CatalogError::UnknownVolume`], [`CatalogError::SpoiltVolume`], or what the
+    /// database says.
+    pub async fn refuse_impossible(&self, volume: &str) -> Result<(), CatalogError> {
+        let of = self.volume(volume).await?;
+        let id = self.volume_id(volume).await?;
+        let (depth, channels) = (of.extent().z, of.channels.len() as u64);
+        let question = "SELECT id, name, section, channel, width, height, deleted FROM tiles WHERE volume = $1 \
+                        AND ((deleted <> 0 AND pyramid <> '') OR (deleted = 0 AND (section < 0 OR section >= $2 \
+                        OR channel < 0 OR channel >= $3 OR width <= 0 OR height <= 0 OR NOT EXISTS \
+                        (SELECT 1 FROM sections s WHERE s.volume = tiles.volume AND s.section = tiles.section)))) \
+                        ORDER BY id LIMIT 1";
+        let wrong = |row: &Row| {
+            let [deleted, section, channel] =
+                ["deleted", "section", "channel"].map(|column| row.get::<i64>(column));
+            let (deleted, section, channel) = (deleted?, section?, channel?);
+            let reason = match () {
+                () if deleted != 0 => {
+                    "it is called deleted, and its pyramid is still named".to_owned()
+                }
+                () if !(0..i64::from(depth)).contains(&section) => {
+                    format!("section {section} of a volume with {depth}")
+                }
+                () if u64::try_from(channel).map_or(true, |channel| channel >= channels) => {
+                    format!("channel {channel} of a volume with {channels}")
+                }
+                () if row.get::<i64>("width")?.min(row.get("height")?) <= 0 => {
+                    "it has no pixels".to_owned()
+                }
+                () => format!("section {section} is said to have no tiles"),
+            };
+            Ok((rows::legible(row, "name"), reason))
+        };
+        let values = [id.into(), depth.into(), channels.into()];
+        let wrong = self.ask(question, &values, wrong).await?;
+        match wrong.into_iter().next() {
+            None => Ok(()),
+            Some((tile, reason)) => Err(CatalogError::SpoiltTile {
+                tile,
+                volume: volume.to_owned(),
+                reason,
+                location: self.location().clone(),
+            }),
+        }
+    }
+
     /// Whether anything is known of a tile: it is there, or was deleted, or waits, or is in quarantine.
     ///
     /// # Errors

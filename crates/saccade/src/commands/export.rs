@@ -18,7 +18,7 @@ use saccade_source::objects::ObjectError;
 
 use crate::arguments::CatalogArgument;
 use crate::interrupt::interrupted;
-use crate::open::Place;
+use crate::open::{Opened, Place};
 use crate::report::say;
 use crate::stitching::Stitching;
 
@@ -111,7 +111,13 @@ impl Export {
         let opened = self
             .place
             .open_with(&self.catalog, volume, &self.stitching, images);
-        let source = opened.await.map_err(hinted)?.source;
+        let Opened {
+            source, catalog, ..
+        } = opened.await.map_err(hinted)?;
+        if let Some(catalog) = catalog {
+            // Nobody who looks for the tiles of a place finds these: the image would lack them in silence.
+            catalog.refuse_impossible(&source.volume().name).await?;
+        }
         let out = self.out.clone();
         let folder = match &out {
             StorageLocation::Folder(folder) => Some(folder.as_path()),

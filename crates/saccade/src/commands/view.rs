@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use clap::Args;
-use saccade_view::{SourceSpec, run};
+use saccade_view::{AskedWith, SourceSpec, run};
 
 use crate::arguments::CatalogArgument;
 use crate::looks::Looks;
@@ -42,10 +42,11 @@ impl View {
         let Opened {
             source,
             acquisition,
+            ..
         } = opened;
         // Before there is a window.
         options.check(source.volume())?;
-        for sentence in options.without_effect(source.volume()) {
+        for sentence in options.without_effect(source.volume(), AskedWith::CommandLine) {
             say(&sentence);
         }
         Ok(run(

@@ -1,7 +1,66 @@
 //! What an export, or a picture, is asked for and cannot be.
 
+use sqlx::sqlite::SqliteConnectOptions;
+use sqlx::{AssertSqlSafe, ConnectOptions as _, Connection as _};
+
 use super::{assert_failed, text};
 use crate::{archive, done, run, stderr};
+
+/// Does to a catalog what no program should.
+fn meddle(archive: &str, statement: &str) {
+    let options = SqliteConnectOptions::new().filename(format!("{archive}/catalog.sqlite"));
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    runtime.unwrap().block_on(async {
+        let mut catalog = options.foreign_keys(false).connect().await.unwrap();
+        let statement = sqlx::query(AssertSqlSafe(statement.to_owned()));
+        let done = statement.execute(&mut catalog).await.unwrap();
+        assert!(done.rows_affected() > 0, "nothing was changed");
+        catalog.close().await.unwrap();
+    });
+}
+
+/// Whoever looks for the tiles of a place does not find these.
+#[test]
+fn tiles_that_cannot_be_are_not_left_out_of_an_export() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    let out = folder.path().join("out.zarr");
+    let part = ["--region", "0,0,0,64,64,2"];
+    for (set, part_of_reason) in [
+        ("section = -3", "section -3 of a volume with 12"),
+        ("section = 12", "section 12 of a volume with 12"),
+        ("channel = 1", "channel 1 of a volume with 1"),
+        ("channel = -1", "channel -1"),
+        ("width = 0", "no pixels"),
+        ("height = -64", "no pixels"),
+        ("deleted = 1", "called deleted"),
+    ] {
+        let kept = std::fs::read(format!("{archive}/catalog.sqlite")).unwrap();
+        meddle(
+            &archive,
+            &format!("UPDATE tiles SET {set} WHERE id = (SELECT max(id) FROM tiles)"),
+        );
+        for more in [&[][..], &part] {
+            let refused = run(["export", &archive, text(&out)].iter().chain(more));
+            let advice = [
+                "cannot be understood",
+                part_of_reason,
+                "saccade check --repair",
+            ];
+            assert_failed(&refused, 1, &advice);
+        }
+        assert!(!out.exists(), "{set}");
+        std::fs::write(format!("{archive}/catalog.sqlite"), kept).unwrap();
+    }
+    meddle(&archive, "DELETE FROM sections WHERE section = 4");
+    let refused = run(["export", &archive, text(&out)]);
+    assert_failed(&refused, 1, &["section 4 is said to have no tiles"]);
+    // As it says.
+    done(["check", &archive, "--repair"]);
+    done(["export", &archive, text(&out)]);
+}
 
 #[test]
 fn what_an_export_finds_in_its_place() {
