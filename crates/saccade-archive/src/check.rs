@@ -28,6 +28,8 @@ mod shared;
 mod tests;
 mod unsound;
 
+use repair::Source;
+
 pub use report::{CheckReport, Finding, FindingKind, Repair, count};
 
 /// What to look at, and what to do about it.
@@ -403,12 +405,17 @@ impl Check<'_> {
         kind: FindingKind,
         entry: &VolumeEntry,
         tile: &Tile,
-        reason: String,
+        mut reason: String,
     ) -> Result<(), CheckError> {
-        let repair = if self.options.repair {
-            Some(self.repair(entry, tile, kind, &reason).await?)
-        } else {
-            None
+        let position = self.position(entry, tile).await?;
+        let source = self.source(entry, Some(&tile.name), position);
+        // Without a repair, what is at hand is told only where it will not do.
+        if self.options.repair || matches!(source, Source::ImageGone(_)) {
+            reason.push_str(&source.advice(kind != FindingKind::Spoilt));
+        }
+        let repair = match self.options.repair {
+            true => Some(self.repair(entry, tile, kind, source, &reason).await?),
+            false => None,
         };
         self.find(kind, entry, Some(tile), reason).repair = repair;
         Ok(())

@@ -5,7 +5,7 @@ use std::hash::BuildHasher as _;
 use glam::UVec2;
 use saccade_core::transform::SectionFromTile;
 
-use super::repair::position_of;
+use super::repair::{Source, position_of};
 use super::{Check, CheckError, Finding, FindingKind, Repair};
 use crate::acquisition::Record;
 use crate::catalog::{CatalogError, SpoiltTile, Tile, VolumeEntry, place};
@@ -23,6 +23,29 @@ impl Check<'_> {
             tile.transform.elements()
         );
         let (name, pyramid) = (&tile.name, &tile.pyramid);
+        let depth = entry.volume.extent().z;
+        if tile.section >= depth {
+            // No transform leads back from there.
+            let source = self.source(entry, Some(name), self.position(entry, tile).await?);
+            let mut repair = None;
+            match source {
+                Source::There(position, record)
+                    if self.options.repair && record.section < depth =>
+                {
+                    let why = format!("the catalog said section {} of it", tile.section);
+                    self.queue(entry, position, record, why).await?;
+                    repair = Some(Repair::Queued);
+                }
+                Source::There(..) => {}
+                source => reason.push_str(&format!(
+                    "{}; or delete it with `saccade update`",
+                    source.advice(false)
+                )),
+            }
+            self.find(FindingKind::Misplaced, entry, Some(tile), reason)
+                .repair = repair;
+            return Ok(());
+        }
         let repair = match self.options.repair {
             true => {
                 let said = self.said(entry, name, pyramid, tile.section, tile.size);
@@ -82,16 +105,16 @@ impl Check<'_> {
         reason: &mut String,
     ) -> Result<Option<Repair>, CheckError> {
         let name = tile.name.as_ref().ok().map(String::as_str);
-        let record = position.and_then(|at| Some((at, self.tile_record(entry, name, at)?)));
-        let Some((position, record)) = record else {
-            reason.push_str(match name {
-                Some(_) => {
-                    "; append the tile's record to its acquisition once more, and ingest enters it anew; with --acquisition \
-                     FOLDER, --repair does so"
-                }
-                None => "; with --acquisition FOLDER the records tell which tile it is",
-            });
-            return Ok(None);
+        let (position, record) = match self.source(entry, name, position) {
+            Source::There(position, record) => (position, record),
+            Source::NoRecords if name.is_none() => {
+                reason.push_str("; with --acquisition FOLDER the records tell which tile it is");
+                return Ok(None);
+            }
+            source => {
+                reason.push_str(&source.advice(false));
+                return Ok(None);
+            }
         };
         if let Some(records) = &mut self.records {
             records.meet(&record.tile);

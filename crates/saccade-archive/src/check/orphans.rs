@@ -116,6 +116,16 @@ impl Check<'_> {
         } else {
             format!("the catalog has no volume of its number {}", stray.volume)
         };
+        let without_copy = match self.known.contains(volume) {
+            true => {
+                "`saccade check --repair --acquisition FOLDER` finds from the records which tiles are lost, and `saccade ingest` \
+                 enters them anew"
+                    .to_owned()
+            }
+            false => format!(
+                "`saccade ingest FOLDER` of its acquisition makes volume {volume:?}, which the catalog lacks, and its tiles anew"
+            ),
+        };
         self.report.findings.push(Finding {
             kind: FindingKind::Spoilt,
             volume: None,
@@ -123,7 +133,7 @@ impl Check<'_> {
             object: Some(object.name.clone()),
             reason: format!(
                 "a row of the catalog names these {} bytes, but {why}: they are never deleted. Put a copy of the catalog in its \
-                 place; without one, `saccade check --repair --acquisition FOLDER` finds from the records which tiles are lost",
+                 place; without one, {without_copy}",
                 object.size
             ),
             repair: None,

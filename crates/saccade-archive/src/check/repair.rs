@@ -7,40 +7,44 @@ use crate::acquisition::{Cursor, Record, RecordReader, TileRecord, image_path};
 use crate::catalog::{Quarantined, Tile, VolumeEntry, Waiting};
 
 impl Check<'_> {
+    /// The position of the record that a tile's pyramid was made of, or is to be.
+    pub(super) async fn position(
+        &self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+    ) -> Result<Option<u64>, CheckError> {
+        if let Some(position) = position_of(&tile.pyramid) {
+            return Ok(Some(position));
+        }
+        // One that had another's, and was given back.
+        let catalog = self.archive.catalog();
+        let origins = catalog.origins(&entry.volume.name, &tile.pyramid).await?;
+        let own = origins.into_iter().find(|origin| origin.tile == tile.name);
+        Ok(own.map(|origin| origin.position))
+    }
+
     /// Gives a tile back to ingest, or puts it into quarantine.
     pub(super) async fn repair(
         &self,
         entry: &VolumeEntry,
         tile: &Tile,
         kind: FindingKind,
+        source: Source,
         reason: &str,
     ) -> Result<Repair, CheckError> {
-        let position = match position_of(&tile.pyramid) {
-            // One that had another's, and was given back.
-            None => {
-                let catalog = self.archive.catalog();
-                let origins = catalog.origins(&entry.volume.name, &tile.pyramid).await?;
-                let own = origins.iter().find(|origin| origin.tile == tile.name);
-                own.map(|origin| origin.position)
-            }
-            position => position,
-        };
-        let record = position.and_then(|at| self.tile_record(entry, Some(&tile.name), at));
         let what = match kind {
             FindingKind::Spoilt => "what the catalog says of it was found wrong",
             _ => "its pyramid was found damaged",
         };
-        if let Some((position, record)) = position.zip(record) {
-            let reason = format!("{what}: {reason}");
+        let reason = format!("{what}: {reason}");
+        if let Source::There(position, record) = source {
             self.queue(entry, position, record, reason).await?;
             return Ok(Repair::Queued);
         }
         let what = Quarantined {
             file: tile.pyramid.clone(),
             tile: Some(tile.name.clone()),
-            reason: format!(
-                "{what} ({reason}); append the tile's record to its acquisition once more, and ingest makes it anew"
-            ),
+            reason,
             bytes: None,
             at: self.archive.catalog().clock().now(),
         };
@@ -48,6 +52,35 @@ impl Check<'_> {
         commit.quarantine(&what).await?;
         commit.finish().await?;
         Ok(Repair::Quarantined)
+    }
+
+    /// Whether what a tile was made of is at hand: of this tile, if that is said.
+    pub(super) fn source(
+        &self,
+        entry: &VolumeEntry,
+        tile: Option<&str>,
+        at: Option<u64>,
+    ) -> Source {
+        let found = at.and_then(|at| Some((at, self.record_at(entry, at)?)));
+        match found {
+            Some((at, (folder, Record::Tile(record))))
+                if tile.is_none_or(|tile| record.tile == tile) =>
+            {
+                let is_there = image_path(&folder, &record.file).is_some_and(|i| i.is_file());
+                match is_there {
+                    true => Source::There(at, record),
+                    false => Source::ImageGone(record.file),
+                }
+            }
+            _ if self.records_are_known(entry) => Source::NoRecord,
+            _ => Source::NoRecords,
+        }
+    }
+
+    /// Whether the records of a volume are at hand.
+    fn records_are_known(&self, entry: &VolumeEntry) -> bool {
+        let of = self.folder_of(entry).zip(self.read);
+        of.is_some_and(|(folder, read)| RecordReader::new(&folder, read).recognize().is_ok())
     }
 
     /// Has ingest work on a record again.
@@ -97,12 +130,50 @@ impl Check<'_> {
         tile: Option<&str>,
         at: u64,
     ) -> Option<TileRecord> {
-        match self.record_at(entry, at)? {
-            (folder, Record::Tile(record)) if tile.is_none_or(|tile| record.tile == tile) => {
-                let image = image_path(&folder, &record.file)?;
-                image.is_file().then_some(record)
-            }
+        match self.source(entry, tile, Some(at)) {
+            Source::There(_, record) => Some(record),
             _ => None,
+        }
+    }
+}
+
+/// What a tile was made of.
+#[derive(Debug)]
+pub(super) enum Source {
+    /// A record, and its image.
+    There(u64, TileRecord),
+    /// A record whose image is not there any more.
+    ImageGone(String),
+    /// The records at hand have none of it.
+    NoRecord,
+    /// No records are at hand.
+    NoRecords,
+}
+
+impl Source {
+    /// What is to be done where it cannot be made anew, after what is wrong; whether its pyramid `is_lost` as well.
+    pub(super) fn advice(&self, is_lost: bool) -> String {
+        match self {
+            Self::There(..) => String::new(),
+            Self::ImageGone(file) => {
+                let neither = match is_lost {
+                    true => "neither of the two is left: ",
+                    false => "",
+                };
+                format!(
+                    ", and its image {file:?} is not in the acquisition's folder any more, so that it cannot be made anew: {neither}put \
+                     a copy of the image there, and `saccade check --repair --acquisition FOLDER` has ingest do it"
+                )
+            }
+            Self::NoRecord => {
+                ", and no record of the acquisition's folder is of it: append the tile's record once more, and ingest makes it anew"
+                    .to_owned()
+            }
+            Self::NoRecords => {
+                "; append the tile's record to its acquisition once more, and ingest makes it anew; with --acquisition FOLDER, \
+                 --repair does so"
+                    .to_owned()
+            }
         }
     }
 }

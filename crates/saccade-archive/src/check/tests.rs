@@ -11,6 +11,7 @@ use crate::catalog::NewTile;
 use crate::image::GrayImage;
 use crate::pyramid::{Encoding, encode};
 
+mod audit;
 mod rows;
 mod unsound;
 

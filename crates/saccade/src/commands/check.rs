@@ -29,9 +29,9 @@ pub(crate) struct Check {
     #[arg(long)]
     quick: bool,
 
-    /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume to where their
-    /// records say; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back
-    /// to `saccade ingest`, or set them aside if --acquisition does not help [default: change nothing]
+    /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume to where their records
+    /// say; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back to
+    /// `saccade ingest`, or set them aside if --acquisition does not help [default: change nothing]
     #[arg(long)]
     repair: bool,
 
@@ -134,7 +134,7 @@ fn line(finding: &Finding) -> String {
         Some(Repair::Reread) => "; `saccade ingest` goes on from what it has",
         Some(Repair::Moved) => "; moved to where its records say",
         Some(Repair::Queued) => "; `saccade ingest` makes it anew",
-        Some(Repair::Quarantined) => "; set aside: append its record once more",
+        Some(Repair::Quarantined) => "; set aside",
         _ => "",
     });
     line

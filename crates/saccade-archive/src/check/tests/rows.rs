@@ -379,3 +379,27 @@ async fn what_a_row_of_no_volume_names_is_told_and_not_deleted() {
         assert!((0..6).all(|n| fixture.path(n).is_file()) && !stray.exists());
     }
 }
+
+/// Where the volume itself is gone, there is none that could be held against records.
+#[tokio::test]
+async fn what_a_row_of_a_volume_that_is_gone_names_comes_back_with_ingest() {
+    let fixture = Fixture::new().await;
+    let file = fixture.folder.path().join("catalog.sqlite");
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(file);
+    let mut meddle = options.foreign_keys(false).connect().await.unwrap();
+    let gone = sqlx::query("DELETE FROM volumes")
+        .execute(&mut meddle)
+        .await;
+    gone.unwrap();
+    meddle.close().await.unwrap();
+    let report = fixture.check(false).await;
+    assert_eq!(report.findings.len(), 6);
+    for finding in report.findings {
+        let reason = finding.reason;
+        assert!(!reason.contains("saccade check --repair"), "{reason}");
+        assert!(
+            reason.contains("`saccade ingest FOLDER` of its acquisition makes volume \"v\""),
+            "{reason}"
+        );
+    }
+}

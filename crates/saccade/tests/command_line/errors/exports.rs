@@ -62,6 +62,37 @@ fn tiles_that_cannot_be_are_not_left_out_of_an_export() {
     done(["export", &archive, text(&out)]);
 }
 
+/// The advice for tiles of a volume that the catalog lacks.
+#[test]
+fn a_volume_that_the_catalog_lost_comes_back_with_ingest() {
+    let folder = tempfile::tempdir().unwrap();
+    let archive = archive(folder.path());
+    meddle(&archive, "DELETE FROM volumes");
+    let acquisition = folder.path().join("acquisition");
+    done([
+        "ingest",
+        text(&acquisition),
+        &archive,
+        "--once",
+        "--lossless",
+    ]);
+    let whole = stderr(&done([
+        "check",
+        &archive,
+        "--repair",
+        "--acquisition",
+        text(&acquisition),
+    ]));
+    assert!(!whole.contains("lost"), "{whole}");
+    let whole = stderr(&done([
+        "check",
+        &archive,
+        "--acquisition",
+        text(&acquisition),
+    ]));
+    assert!(whole.contains("all whole"), "{whole}");
+}
+
 #[test]
 fn what_an_export_finds_in_its_place() {
     let folder = tempfile::tempdir().unwrap();
