@@ -18,6 +18,7 @@ use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
 use crate::storage::StorageError;
 
+mod half_deleted;
 mod misplaced;
 mod orphans;
 mod records;
@@ -96,7 +97,8 @@ pub enum CheckError {
 /// [`CheckOptions::repair`] its indexes are made anew, and where it is sound then, the rest follows.
 ///
 /// Where the records are at hand, the catalog is held against them: a tile that it lacks, or of which it says something else
-/// than the record, is found, and given back to ingest if that is wanted.
+/// than the record, is found, and given back to ingest if that is wanted. A row that is called deleted and is not as a
+/// deletion leaves it is brought back.
 ///
 /// # Errors
 ///
@@ -224,6 +226,7 @@ impl Check<'_> {
             self.report.tiles += 1;
             self.spoilt(entry, spoilt).await?;
         }
+        self.half_deleted(entry).await?;
         self.lost(entry).await?;
         self.spoilt_waiting(entry).await?;
         let tiles = self.report.tiles - before;

@@ -1,6 +1,7 @@
 //! One transaction: everything in it happens, or nothing.
 
 mod remembered;
+mod undeleted;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;

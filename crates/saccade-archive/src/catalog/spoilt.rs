@@ -123,6 +123,23 @@ impl Catalog {
         }
     }
 
+    /// The rows of tiles that are said to be deleted as no deletion leaves them: they name their pyramid still.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn half_deleted(
+        &self,
+        volume: &str,
+    ) -> Result<Vec<Result<Tile, SpoiltTile>>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                        pyramid, revision, position, transform_position FROM tiles \
+                        WHERE volume = $1 AND deleted <> 0 AND pyramid <> '' ORDER BY id";
+        self.ask(question, &[id.into()], rows::tile_whose_records_are_known)
+            .await
+    }
+
     /// Whether anything is known of a tile: it is there, or was deleted, or waits, or is in quarantine.
     ///
     /// # Errors

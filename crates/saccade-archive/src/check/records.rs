@@ -81,6 +81,12 @@ impl Records {
         Some(records)
     }
 
+    /// Whether the newest of a tile's records is its end.
+    pub(super) fn is_deleted(&self, tile: &str) -> bool {
+        let newest = self.newest.get(&self.hasher.hash_one(tile));
+        newest.is_some_and(|newest| newest.image.is_none())
+    }
+
     /// The catalog has a tile.
     pub(super) fn meet(&mut self, tile: &str) {
         let hash = self.hasher.hash_one(tile);

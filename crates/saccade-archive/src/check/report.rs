@@ -50,6 +50,7 @@ impl Finding {
                     | Repair::Kept
                     | Repair::Reread
                     | Repair::Reindexed
+                    | Repair::Restored
             )
         )
     }
@@ -97,6 +98,8 @@ pub enum Repair {
     Moved,
     /// The pyramid is no longer to be deleted.
     Kept,
+    /// The tile is no longer called deleted.
+    Restored,
     /// How far the records were read is found out from them: ingest goes on from there.
     Reread,
     /// The indexes of the catalog's file are made anew, and it is sound.

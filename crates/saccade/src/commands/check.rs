@@ -30,7 +30,8 @@ pub(crate) struct Check {
     quick: bool,
 
     /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume to where their records
-    /// say; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back to
+    /// say; bring back tiles that are called deleted and are not as a deletion leaves
+    /// them; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back to
     /// `saccade ingest`, or set them aside if --acquisition does not help [default: change nothing]
     #[arg(long)]
     repair: bool,
@@ -130,6 +131,7 @@ fn line(finding: &Finding) -> String {
         Some(Repair::Deleted) => "; deleted",
         Some(Repair::Recounted) => "; counted anew",
         Some(Repair::Kept) => "; it is kept",
+        Some(Repair::Restored) => "; it is brought back",
         Some(Repair::Reindexed) => "; its indexes are made anew, and it is sound",
         Some(Repair::Reread) => "; `saccade ingest` goes on from what it has",
         Some(Repair::Moved) => "; moved to where its records say",

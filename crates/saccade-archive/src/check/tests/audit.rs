@@ -1,6 +1,7 @@
 //! What the catalog says that its pyramids or records do not.
 
 use super::*;
+use crate::acquisition::DeleteRecord;
 
 impl Fixture {
     async fn look(&self, repair: bool) -> CheckReport {
@@ -13,11 +14,85 @@ impl Fixture {
         check(&self.archive, &options, &|_, _| {}).await.unwrap()
     }
 
+    /// Appends a record that counts as read, and returns its position.
+    async fn append(&self, record: &Record) -> u64 {
+        let mut writer = RecordWriter::open(self.acquisition.path()).unwrap();
+        let path = self.acquisition.path().join(RecordReader::FILE);
+        let position = fs::metadata(&path).unwrap().len();
+        writer.append(record).unwrap();
+        let read = Cursor {
+            offset: fs::metadata(&path).unwrap().len(),
+            ..self.cursor().await
+        };
+        self.set_cursor(read).await;
+        position
+    }
+
+    async fn cursor(&self) -> Cursor {
+        self.archive.catalog().cursor(VOLUME).await.unwrap()
+    }
+
+    async fn set_cursor(&self, read: Cursor) {
+        let mut commit = self.archive.catalog().begin(VOLUME).await.unwrap();
+        commit.cursor(read).await.unwrap();
+        commit.finish().await.unwrap();
+    }
 }
 
 fn repairs(report: &CheckReport) -> Vec<(FindingKind, Option<Repair>)> {
     let all = report.findings.iter().map(|f| (f.kind, f.repair));
     all.collect()
+}
+
+#[tokio::test]
+async fn tiles_that_no_deletion_took_are_brought_back() {
+    let fixture = Fixture::new().await;
+    let delete = "UPDATE tiles SET deleted = 1 WHERE name IN ('t2', 't3')";
+    fixture.meddle(&[delete]).await;
+    for quick in [true, false] {
+        let report = fixture.check(quick).await;
+        let (t2, t3) = ((FindingKind::Spoilt, "t2"), (FindingKind::Spoilt, "t3"));
+        assert_eq!(found(&report), [t2, t3]);
+        let reason = &report.findings[0].reason;
+        assert!(
+            reason.contains("deleted") && reason.contains("--repair"),
+            "{reason}"
+        );
+    }
+    let before = fixture.archive.catalog().revision(VOLUME).await.unwrap();
+    let report = fixture.look(true).await;
+    let back = (FindingKind::Spoilt, Some(Repair::Restored));
+    assert_eq!((repairs(&report), report.damage()), (vec![back; 2], 0));
+    let now = fixture.archive.catalog().entry(VOLUME).await.unwrap();
+    assert_eq!((now.tiles, now.revision), (u64::from(TILES), before + 2));
+    assert_eq!(fixture.check(false).await.findings, []);
+
+    // One whose pyramid is gone is made anew; one whose records say so is gone.
+    fixture.meddle(&[delete]).await;
+    fs::remove_file(fixture.path(2)).unwrap();
+    let gone = DeleteRecord { tile: "t3".into() };
+    fixture.append(&Record::Delete(gone)).await;
+    let report = fixture.look(true).await;
+    let of_t2 = report
+        .findings
+        .iter()
+        .find(|f| f.tile.as_deref() == Some("t2"));
+    assert_eq!(of_t2.unwrap().repair, Some(Repair::Queued));
+    assert!(
+        report
+            .findings
+            .iter()
+            .all(|f| f.tile.as_deref() != Some("t3"))
+    );
+    assert!(
+        fixture
+            .archive
+            .catalog()
+            .tile(VOLUME, "t3")
+            .await
+            .unwrap()
+            .is_none()
+    );
 }
 
 #[tokio::test]

@@ -1,0 +1,85 @@
+//! Tiles that are said to be deleted, of which no deletion is known.
+
+use std::hash::BuildHasher as _;
+
+use super::repair::Source;
+use super::{Check, CheckError, Finding, FindingKind, Repair};
+use crate::catalog::{Tile, VolumeEntry, place};
+
+impl Check<'_> {
+    /// Finds rows that are said to be deleted and name their pyramid still, as no deletion leaves them. Those whose records say so,
+    /// too, are deleted.
+    pub(super) async fn half_deleted(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
+        let volume = &entry.volume.name;
+        for row in self.archive.catalog().half_deleted(volume).await? {
+            let (name, pyramid) = match &row {
+                Ok(tile) => (Some(&tile.name), Some(&tile.pyramid)),
+                Err(spoilt) => (spoilt.name.as_ref().ok(), spoilt.pyramid.as_ref().ok()),
+            };
+            if let Some(pyramid) = pyramid {
+                self.named.insert(self.hasher.hash_one(pyramid));
+            }
+            let is_told = name.zip(self.records.as_ref());
+            if is_told.is_some_and(|(name, records)| records.is_deleted(name)) {
+                continue;
+            }
+            self.report.tiles += 1;
+            if let Some((name, records)) = name.zip(self.records.as_mut()) {
+                records.meet(name);
+            }
+            match row {
+                Ok(tile) => self.bring_back(entry, &tile).await?,
+                Err(spoilt) => self.spoilt(entry, spoilt).await?,
+            }
+        }
+        Ok(())
+    }
+
+    async fn bring_back(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<(), CheckError> {
+        let mut reason =
+            "the catalog calls it deleted, but names its pyramid still, as no deletion leaves it"
+                .to_owned();
+        let looked = self.look(tile).await;
+        let is_placed = place(
+            entry.volume.extent(),
+            tile.section,
+            tile.size,
+            tile.transform,
+        )
+        .is_some();
+        let is_whole = is_placed && looked.is_ok_and(|(verified, _)| !verified.mistaken);
+        let mut repair = None;
+        if is_whole {
+            if self.options.repair {
+                let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+                commit.undelete(tile).await?;
+                commit.finish().await?;
+                repair = Some(Repair::Restored);
+            } else {
+                reason.push_str(
+                    ": `saccade check --repair` brings it back, and what should be gone `saccade update` deletes then",
+                );
+            }
+        } else {
+            reason.push_str("; its pyramid is not whole");
+            match self.source(entry, Some(&tile.name), self.position(entry, tile).await?) {
+                Source::There(position, record) if self.options.repair => {
+                    let why = format!("{reason}, and no record says that it is deleted");
+                    self.queue(entry, position, record, why).await?;
+                    repair = Some(Repair::Queued);
+                }
+                Source::There(..) => {}
+                source => reason.push_str(&source.advice(true)),
+            }
+        }
+        self.report.findings.push(Finding {
+            kind: FindingKind::Spoilt,
+            volume: Some(entry.volume.name.clone()),
+            tile: Some(tile.name.clone()),
+            object: Some(tile.pyramid.clone()),
+            reason,
+            repair,
+        });
+        Ok(())
+    }
+}
