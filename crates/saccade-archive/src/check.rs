@@ -18,6 +18,7 @@ use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
 use crate::storage::StorageError;
 
+mod cursor;
 mod half_deleted;
 mod misplaced;
 mod orphans;
@@ -141,6 +142,7 @@ pub async fn check(
         miscounted: Vec::new(),
         lacking: HashSet::new(),
         doubtful: HashSet::new(),
+        unread: HashSet::new(),
     };
     for volume in volumes {
         match volume.entry {
@@ -191,6 +193,8 @@ struct Check<'a> {
     lacking: HashSet<String>,
     /// Those of them with objects that may be of tiles that were lost.
     doubtful: HashSet<String>,
+    /// Volumes of which it is not known how far their records were read.
+    unread: HashSet<String>,
 }
 
 impl Check<'_> {

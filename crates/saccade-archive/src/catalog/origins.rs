@@ -1,5 +1,6 @@
 //! Which tiles name a pyramid, and which records say what these are.
 
+use super::database::Row;
 use super::{Catalog, CatalogError, rows};
 
 /// Which records say what a tile is.
@@ -52,6 +53,28 @@ impl Catalog {
                         WHERE volume = $1 AND pyramid = $2 AND deleted = 0 ORDER BY id";
         let values = [id.into(), pyramid.into()];
         self.ask(question, &values, rows::origin).await
+    }
+
+    /// The tiles that were entered last, as far as their records tell, at most `most`: names, and positions of records. Looks at
+    /// all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn newest_records(
+        &self,
+        volume: &str,
+        most: u32,
+    ) -> Result<Vec<(String, u64)>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT name, position FROM tiles WHERE volume = $1 AND deleted = 0 \
+                        ORDER BY position DESC LIMIT $2";
+        let newest = |row: &Row| {
+            let position = rows::unsigned(row, "position").unwrap_or(u64::MAX);
+            Ok((rows::legible(row, "name"), position))
+        };
+        let values = [id.into(), most.into()];
+        self.ask(question, &values, newest).await
     }
 
     /// Whether a tile names a pyramid, which is looked for where a pyramid of that name belongs: in its section, and with

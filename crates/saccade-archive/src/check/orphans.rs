@@ -180,6 +180,8 @@ impl Check<'_> {
         };
         let catalog = self.archive.catalog();
         match catalog.cursor(volume).await {
+            // How far they were read is not known.
+            Ok(_) if self.unread.contains(volume) => Ok(Whence::Later),
             Ok(read) if position < read.offset => {
                 let to_be_done = catalog.is_to_be_done(volume, position).await?;
                 Ok(match to_be_done {

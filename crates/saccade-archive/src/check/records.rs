@@ -9,11 +9,11 @@ use glam::UVec2;
 use super::repair::position_of;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
 use crate::acquisition::{AcquisitionInfo, Cursor, Record, RecordReader};
-use crate::catalog::{CatalogError, Tile, VolumeEntry};
+use crate::catalog::{Tile, VolumeEntry};
 use crate::randomness::Keyed;
 
 /// Records that are read at once.
-const AT_ONCE: usize = 4096;
+pub(super) const AT_ONCE: usize = 4096;
 
 /// What the records that were read say of each tile, by hashes of names: some 60 bytes of memory per tile.
 #[derive(Debug)]
@@ -128,63 +128,6 @@ impl Records {
 }
 
 impl Check<'_> {
-    /// How far the records of a volume were read. Where that cannot be understood, it is found out if it is to be repaired.
-    pub(super) async fn read_up_to(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
-        let catalog = self.archive.catalog();
-        let spoilt = match catalog.cursor(&entry.volume.name).await {
-            Ok(read) => {
-                self.read = Some(read);
-                return Ok(());
-            }
-            Err(error @ CatalogError::SpoiltCursor { .. }) => error,
-            Err(error) => return Err(error.into()),
-        };
-        self.read = None;
-        let mut repair = None;
-        if self.options.repair
-            && let Some(found) = self.find_cursor(entry).await?
-        {
-            let mut commit = catalog.begin(&entry.volume.name).await?;
-            commit.cursor(found).await?;
-            commit.finish().await?;
-            self.read = Some(found);
-            repair = Some(Repair::Reread);
-        }
-        let reason = spoilt.without_place();
-        self.find(FindingKind::Spoilt, entry, None, reason).repair = repair;
-        Ok(())
-    }
-
-    /// The end of the last record of which the catalog has anything. What of those after it was read already says nothing
-    /// new when it is read once more.
-    async fn find_cursor(&self, entry: &VolumeEntry) -> Result<Option<Cursor>, CheckError> {
-        let Some(folder) = self.folder_of(entry) else {
-            return Ok(None);
-        };
-        let last = self
-            .archive
-            .catalog()
-            .last_position(&entry.volume.name)
-            .await?;
-        let Some(last) = last else {
-            return Ok(Some(Cursor::default()));
-        };
-        let mut reader = RecordReader::new(&folder, Cursor::default());
-        loop {
-            let Ok(lines) = reader.read(AT_ONCE) else {
-                return Ok(None);
-            };
-            // Records that end before are another acquisition's.
-            if lines.is_empty() {
-                return Ok(None);
-            }
-            let behind = lines.into_iter().map(|line| line.next);
-            if let Some(next) = behind.filter(|next| next.offset > last).min() {
-                return Ok(Some(next));
-            }
-        }
-    }
-
     /// What the records say, if they are at hand; and whether the volume is as they say.
     pub(super) async fn read_records(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
         self.records = None;

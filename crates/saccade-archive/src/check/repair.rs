@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::{Check, CheckError, FindingKind, Repair};
-use crate::acquisition::{Cursor, Record, RecordReader, TileRecord, image_path};
+use crate::acquisition::{Record, RecordReader, TileRecord, image_path};
 use crate::catalog::{Quarantined, Tile, VolumeEntry, Waiting};
 
 impl Check<'_> {
@@ -113,13 +113,7 @@ impl Check<'_> {
     pub(super) fn record_at(&self, entry: &VolumeEntry, at: u64) -> Option<(PathBuf, Record)> {
         let folder = self.folder_of(entry)?;
         RecordReader::new(&folder, self.read?).recognize().ok()?;
-        let cursor = Cursor {
-            offset: at,
-            ..Cursor::default()
-        };
-        let mut reader = RecordReader::new(&folder, cursor);
-        let line = reader.read(1).ok()?.into_iter().next()?;
-        let record = line.record.ok().filter(|_| line.offset == at)?;
+        let record = super::cursor::record_at(&folder, at)?;
         Some((folder, record))
     }
 

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::Args;
 use indicatif::ProgressBar;
+use saccade_archive::acquisition::RecordReader;
 use saccade_archive::catalog::{Catalog, CatalogError};
 use saccade_archive::check::{
     CheckOptions, CheckReport, Finding, FindingKind, Repair, check, count,
@@ -63,11 +64,22 @@ impl Check {
             }
             archive => (archive?, 0),
         };
+        let watched = super::ingest::beside(&location);
+        let is_read = |folder: &PathBuf| folder.join(RecordReader::FILE).is_file();
+        if let Some(folder) = self.acquisition.as_ref().filter(|folder| !is_read(folder))
+            && !watched.as_ref().is_some_and(|watched| watched.is_dir())
+        {
+            say(&format!(
+                "no records ({}) are in the acquisition's folder, and nothing is compared with any: {}",
+                RecordReader::FILE,
+                folder.display()
+            ));
+        }
         let options = CheckOptions {
             quick: self.quick,
             repair: self.repair,
             acquisition: self.acquisition,
-            watched: super::ingest::beside(&location),
+            watched,
             ..CheckOptions::default()
         };
         // Draws nothing where there is no terminal.

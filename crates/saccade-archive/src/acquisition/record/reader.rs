@@ -1,7 +1,7 @@
 //! Records are read as they are appended.
 
 use std::fs::File;
-use std::io::{self, BufReader, Seek as _, SeekFrom};
+use std::io::{self, BufReader, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use super::prefix::{HEAD, MAX_LINE, Prefix, read_line};
@@ -85,6 +85,32 @@ impl RecordReader {
             self.cursor.seen = Some(prefix.seen());
         }
         Ok(self.cursor)
+    }
+
+    /// Whether a line begins at the cursor, or the records begin or end there.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::read`].
+    pub fn is_between_lines(&self) -> Result<bool, AcquisitionError> {
+        let look = || {
+            let mut file = match self.open()? {
+                Ok(Some((file, _))) => file,
+                Ok(None) => return Ok(Ok(true)),
+                Err(error) => return Ok(Err(error)),
+            };
+            let Some(before) = self.cursor.offset.checked_sub(1) else {
+                return Ok(Ok(true));
+            };
+            let mut last = [0];
+            file.seek(SeekFrom::Start(before))?;
+            file.read_exact(&mut last)?;
+            Ok(Ok(last == *b"\n"))
+        };
+        look().map_err(|source| AcquisitionError::Read {
+            source,
+            path: self.path.clone(),
+        })?
     }
 
     /// The next whole lines, at most `max`; empty lines are skipped. None if there is no file yet.

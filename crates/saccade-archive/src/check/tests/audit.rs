@@ -96,6 +96,57 @@ async fn tiles_that_no_deletion_took_are_brought_back() {
 }
 
 #[tokio::test]
+async fn records_are_not_read_up_to_where_no_line_begins() {
+    let fixture = Fixture::new().await;
+    let mut reader = RecordReader::new(fixture.acquisition.path(), Cursor::default());
+    reader.read(9).unwrap();
+    let right = reader.cursor();
+    for seen in [None, right.seen] {
+        for (offset, words) in [
+            (right.offset - 7, ["midst of a line", "not what was read"]),
+            (right.offset + 900, ["bytes", "bytes"]),
+        ] {
+            let wrong = Cursor {
+                offset,
+                seen,
+                ..right
+            };
+            fixture.set_cursor(wrong).await;
+            // Nothing else tells how far they were read.
+            assert_eq!(fixture.check(false).await.findings, []);
+            let report = fixture.look(false).await;
+            assert_eq!(repairs(&report), [(FindingKind::Spoilt, None)]);
+            let reason = &report.findings[0].reason;
+            let word = words[usize::from(seen.is_some())];
+            assert!(
+                reason.contains(word) && reason.contains("--repair"),
+                "{reason}"
+            );
+            let report = fixture.look(true).await;
+            assert_eq!(
+                repairs(&report),
+                [(FindingKind::Spoilt, Some(Repair::Reread))]
+            );
+            assert_eq!(fixture.cursor().await, right);
+            assert_eq!(fixture.look(false).await.findings, []);
+        }
+    }
+    // Others have their place: nothing is found out from them, and nothing deleted.
+    let list = fixture.acquisition.path().join(RecordReader::FILE);
+    let said = fs::read_to_string(&list).unwrap();
+    fs::write(&list, said.replace("\"t", "\"u")).unwrap();
+    let stray = fixture.folder.path().join("tiles/v/000000/stray-7.tif");
+    fs::write(&stray, "stray").unwrap();
+    let report = fixture.look(true).await;
+    let want = [(FindingKind::Spoilt, None), (FindingKind::Orphan, None)];
+    assert_eq!(repairs(&report), want);
+    let reason = &report.findings[0].reason;
+    assert!(reason.contains("--acquisition"), "{reason}");
+    assert!(stray.exists());
+    assert_eq!(fixture.cursor().await, right);
+}
+
+#[tokio::test]
 async fn of_what_nothing_is_left_that_is_told() {
     let fixture = Fixture::new().await;
     fs::write(fixture.path(1), "damaged").unwrap();
