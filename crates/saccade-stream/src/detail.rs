@@ -2,11 +2,14 @@
 
 use std::ops::RangeInclusive;
 
-use glam::{DVec3, UVec3};
-use saccade_core::brick::{BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS};
+use glam::{DVec3, IVec3, UVec3};
+use saccade_core::brick::{
+    BRICK_BORDER, BRICK_EDGE, BRICK_STORED_EDGE, BRICK_STORED_VOXELS, BrickId, bricks_of,
+};
 use saccade_core::volume::{Dtype, Volume};
+use saccade_core::voxel_box::VoxelBox;
 
-/// Bricks of a level that are looked at, and have to be, before it is judged.
+/// Bricks of a level that are looked at, and have to be, before it is judged; all where it has fewer.
 const JUDGED_BRICKS: u32 = 16;
 /// A level is not needed when the next coarser one has all but this share of its variance.
 const MOST_LOST: f64 = 0.01;
@@ -51,9 +54,12 @@ impl Default for Content {
 }
 
 /// Squared differences of values.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 struct Spread {
-    bricks: u32,
+    /// Which bricks were looked at.
+    bricks: Vec<UVec3>,
+    /// So many are enough to judge by; nothing is known of a level without any.
+    enough: u32,
     /// From the mean of their brick.
     all: f64,
     /// From the mean of the voxel of the next coarser level that they are in.
@@ -61,10 +67,10 @@ struct Spread {
 }
 
 impl Content {
-    /// Whether a brick of this level would tell something new.
-    pub(crate) fn wants(&self, level: u32) -> bool {
-        let known = self.levels.get(level as usize);
-        known.is_none_or(|spread| spread.bricks < JUDGED_BRICKS)
+    /// Whether a brick would tell something new.
+    pub(crate) fn wants(&self, id: BrickId) -> bool {
+        let known = self.levels.get(id.level() as usize);
+        known.is_none_or(|spread| !spread.is_judged() && !spread.bricks.contains(&id.brick()))
     }
 
     /// Forgets what was seen when as many finest voxels have changed since as ever before, or half of all `whole`:
@@ -81,8 +87,8 @@ impl Content {
     }
 
     /// Takes a brick's values, stored with its border, little-endian, into account.
-    pub(crate) fn note(&mut self, volume: &Volume, level: u32, voxels: &[u8]) {
-        let (at, next) = (level as usize, level as usize + 1);
+    pub(crate) fn note(&mut self, volume: &Volume, id: BrickId, voxels: &[u8]) {
+        let (at, next) = (id.level() as usize, id.level() as usize + 1);
         if at >= volume.levels.len() {
             return;
         }
@@ -94,7 +100,7 @@ impl Content {
             _ => voxels.iter().copied().map(u16::from).collect(),
         };
         // Of the coarsest level, too: its few bricks show what those that were looked at elsewhere leave out.
-        self.range = values.iter().fold(self.range, |range, &value| {
+        self.range = { inside(volume, id, &values) }.fold(self.range, |range, value| {
             let [least, most] = range.unwrap_or([value; 2]);
             Some([least.min(value), most.max(value)])
         });
@@ -105,7 +111,9 @@ impl Content {
             self.levels.resize(next, Spread::default());
         }
         let spread = &mut self.levels[at];
-        spread.bricks += 1;
+        let there = bricks_of(here.extent);
+        spread.enough = { there.element_product() }.clamp(1, JUDGED_BRICKS);
+        spread.bricks.push(id.brick());
         let edge = block_edge(coarser.downsampling / here.downsampling);
         if values.len() == BRICK_STORED_VOXELS {
             spread.add(&values, edge);
@@ -118,10 +126,9 @@ impl Content {
         let alike = self
             .range
             .is_some_and(|[least, most]| least == most && least > 0);
-        let judged = |s: &Spread| s.bricks >= JUDGED_BRICKS;
-        let needed = |s: &Spread| judged(s) && s.lost > MOST_LOST * s.all;
+        let needed = |s: &Spread| s.is_judged() && s.lost > MOST_LOST * s.all;
         let not_needed =
-            |s: &Spread| judged(s) && (s.all > 0.0 || alike) && s.lost <= MOST_LOST * s.all;
+            |s: &Spread| s.is_judged() && (s.all > 0.0 || alike) && s.lost <= MOST_LOST * s.all;
         let first = self.levels.iter().position(needed);
         let below = &self.levels[..first.unwrap_or(self.levels.len())];
         let last = below.iter().rposition(not_needed);
@@ -137,7 +144,24 @@ fn block_edge(ratio: DVec3) -> UVec3 {
         .as_uvec3()
 }
 
+/// Values of a stored brick that lie in the volume: what it carries around that was not acquired anywhere.
+fn inside(volume: &Volume, id: BrickId, values: &[u16]) -> impl Iterator<Item = u16> {
+    let extent = volume.levels[id.level() as usize].extent.as_ivec3();
+    let low = (id.brick() * BRICK_EDGE).as_ivec3() - IVec3::splat(BRICK_BORDER.cast_signed());
+    let is_whole = values.len() == BRICK_STORED_VOXELS;
+    let cells = VoxelBox::of_size(UVec3::splat(BRICK_STORED_EDGE)).iter();
+    { cells.zip(values) }.filter_map(move |(cell, value)| {
+        let at = low + cell.as_ivec3();
+        let is_inside = at.cmpge(IVec3::ZERO).all() && at.cmplt(extent).all();
+        (is_inside || !is_whole).then_some(*value)
+    })
+}
+
 impl Spread {
+    fn is_judged(&self) -> bool {
+        self.enough > 0 && self.bricks.len() >= self.enough as usize
+    }
+
     /// Blocks with a voxel that was not acquired are left out.
     fn add(&mut self, values: &[u16], edge: UVec3) {
         let count = f64::from(edge.element_product());
@@ -180,8 +204,6 @@ impl Spread {
 
 #[cfg(test)]
 mod tests {
-    use saccade_core::voxel_box::VoxelBox;
-
     use super::*;
 
     fn volume(dtype: Dtype) -> Volume {
@@ -205,6 +227,11 @@ mod tests {
         bytes.collect()
     }
 
+    /// Some brick of a level, another for each number.
+    fn id(level: u32, number: u32) -> BrickId {
+        BrickId::new(0, level, UVec3::new(number, 0, 0)).unwrap()
+    }
+
     fn noted(dtype: Dtype, levels: &[(u32, f64)]) -> Content {
         let volume = volume(dtype);
         let scale = if dtype == Dtype::Uint16 { 250.0 } else { 1.0 };
@@ -212,11 +239,12 @@ mod tests {
         for &(level, wavelength) in levels {
             let wave = |x: u32| (f64::from(x) * std::f64::consts::TAU / wavelength).sin();
             let value = |at: UVec3| scale * (120.0 + 50.0 * wave(at.x) + 50.0 * wave(at.y));
-            for _ in 0..JUDGED_BRICKS {
-                assert!(content.wants(level));
-                content.note(&volume, level, &brick(dtype, value));
+            for number in 0..JUDGED_BRICKS {
+                assert!(content.wants(id(level, number)));
+                content.note(&volume, id(level, number), &brick(dtype, value));
+                assert!(!content.wants(id(level, number)), "it was looked at");
             }
-            assert!(!content.wants(level));
+            assert!(!content.wants(id(level, 99)));
         }
         content
     }
@@ -244,7 +272,10 @@ mod tests {
         content.change(few - 1, 1 << 40);
         assert_eq!(content.finest_needed(), 1, "little has changed");
         content.change(1, 1 << 40);
-        assert_eq!((content.finest_needed(), content.wants(0)), (0, true));
+        assert_eq!(
+            (content.finest_needed(), content.wants(id(0, 0))),
+            (0, true)
+        );
         let mut times = 0;
         for _ in 0..1000 {
             content.levels.clone_from(&judged);
@@ -271,11 +302,11 @@ mod tests {
             let alike = |levels: u32| {
                 let mut content = Content::default();
                 for level in 0..levels {
-                    for _ in 0..JUDGED_BRICKS {
-                        content.note(&volume, level, &of(251.0));
+                    for number in 0..JUDGED_BRICKS {
+                        content.note(&volume, id(level, number), &of(251.0));
                     }
                 }
-                content.note(&volume, coarsest, &of(251.0));
+                content.note(&volume, id(coarsest, 0), &of(251.0));
                 content
             };
             assert_eq!(alike(0).finest_needed(), 0, "nothing fine was seen");
@@ -285,13 +316,46 @@ mod tests {
             let other = brick(dtype, |at| if at.x == 30 { 250.0 } else { 251.0 });
             for seen in [other, of(250.0), of(0.0)] {
                 let mut content = alike(1);
-                content.note(&volume, coarsest, &seen);
+                content.note(&volume, id(coarsest, 0), &seen);
                 assert_eq!(content.finest_needed(), 0);
             }
             let mut content = alike(1);
             content.change(u64::MAX, u64::MAX);
-            content.note(&volume, 0, &of(9.0));
+            content.note(&volume, id(0, 0), &of(9.0));
             assert_eq!((content.finest_needed(), content.range), (0, Some([9; 2])));
+        }
+    }
+
+    /// Two bricks of level 0 and one of the next, of which most lies outside.
+    #[test]
+    fn a_level_of_few_bricks_is_judged_by_all_of_them() {
+        let extent = UVec3::new(45, 29, 23);
+        let volume = Volume::new("v", extent, DVec3::splat(4.0)).unwrap();
+        assert_eq!(volume.levels.len(), 2);
+        let stored = |id: BrickId, value: fn(IVec3) -> f64| {
+            let low = (id.brick() * BRICK_EDGE).as_ivec3() - 1;
+            let extent = volume.levels[id.level() as usize].extent.as_ivec3();
+            brick(Dtype::Uint8, |cell| {
+                let at = low + cell.as_ivec3();
+                let inside = at.cmpge(IVec3::ZERO).all() && at.cmplt(extent).all();
+                if inside { value(at) } else { 0.0 }
+            })
+        };
+        let steep = |at: IVec3| if at.x % 2 == 0 { 50.0 } else { 90.0 };
+        for (value, needed) in [((|_| 90.0) as fn(IVec3) -> f64, 1), (steep, 0)] {
+            let mut content = Content::default();
+            for (id, judged) in [
+                (id(1, 0), 0),
+                (id(0, 0), 0),
+                (id(0, 0), 0),
+                (id(0, 1), needed),
+            ] {
+                if content.wants(id) {
+                    content.note(&volume, id, &stored(id, value));
+                }
+                assert_eq!(content.finest_needed(), judged, "{id}");
+            }
+            assert!(!content.wants(id(0, 0)));
         }
     }
 
@@ -316,13 +380,13 @@ mod tests {
     fn nothing_is_judged_by_few_bricks_or_by_what_was_not_acquired() {
         let volume = volume(Dtype::Uint8);
         let mut content = Content::default();
-        content.note(&volume, 0, &brick(Dtype::Uint8, |_| 90.0));
+        content.note(&volume, id(0, 0), &brick(Dtype::Uint8, |_| 90.0));
         assert_eq!(content.finest_needed(), 0);
         let mut content = Content::default();
         // Half of it not acquired: a step that no voxel has.
         let half = brick(Dtype::Uint8, |at| if at.x < 17 { 0.0 } else { 90.0 });
-        for _ in 0..JUDGED_BRICKS {
-            content.note(&volume, 0, &half);
+        for number in 0..JUDGED_BRICKS {
+            content.note(&volume, id(0, number), &half);
         }
         assert_eq!(content.levels[0].lost, 0.0);
         assert_eq!(
@@ -331,8 +395,8 @@ mod tests {
             "where it ends, coarser levels differ"
         );
         let coarsest = u32::try_from(volume.levels.len() - 1).unwrap();
-        content.note(&volume, coarsest, &half);
-        content.note(&volume, coarsest + 7, &half);
-        assert!(content.wants(coarsest), "there is nothing coarser");
+        content.note(&volume, id(coarsest, 0), &half);
+        content.note(&volume, id(coarsest + 7, 0), &half);
+        assert!(content.wants(id(coarsest, 0)), "there is nothing coarser");
     }
 }

@@ -389,9 +389,9 @@ impl Session {
             let channel = id.channel() as usize;
             // Whatever the detail is now: who chooses it by content later has no bricks that arrive then.
             if let BrickVoxels::Voxels(voxels) = voxels
-                && contents[channel].wants(id.level())
+                && contents[channel].wants(id)
             {
-                contents[channel].note(renderer.volume(), id.level(), voxels);
+                contents[channel].note(renderer.volume(), id, voxels);
                 if channels[channel].detail == Detail::ByContent {
                     judged.push(channel);
                 }
