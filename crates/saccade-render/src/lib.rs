@@ -58,7 +58,8 @@
 //!   than 1/4096 of the light is left, and encoded as sRGB.
 //! - With [`Mode::Maximum`] the largest value along the ray gives the colour of its channel, and the light
 //!   of channels is added; with [`Mode::IsoSurface`] the ray ends where a channel's value, linear
-//!   between samples, passes its bound, lit by how much the surface faces the eye.
+//!   between samples, passes its bound, lit by how much the surface faces the eye; what a face of the volume or a
+//!   clip cuts through faces it as the cut does. Its colour is that of the bound, half as bright as can be at least.
 //! - **Clipping** ([`Clip`]) cuts the ray before it is cut into segments.
 //! - 16-bit voxels are **exact**: in textures of 16 bit, or as two parts of 8 bit that are joined before they
 //!   are interpolated.

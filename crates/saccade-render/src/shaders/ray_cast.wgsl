@@ -18,6 +18,8 @@ const FIRST_ROW = 32u;
 const ROW = 64u;
 // Light that is left when a ray ends: less than one step of the picture even on white.
 const TERMINATION = 0.000244140625;
+// The largest part of a surface's colour, where it faces the eye, at least.
+const SURFACE_LIGHT = 0.5;
 // After so many segments a ray's steps double, and again after as many: all rays end.
 const SEGMENTS_PER_DOUBLING = 8192u;
 // Levels finer than wanted that may stand in, when no coarser one does.
@@ -178,6 +180,9 @@ var<private> surface_at: vec3f;
 var<private> hit_at: f32;
 // Light that comes through to it; 0 where there is none.
 var<private> surface_light: f32;
+// Whether the ray began in it: it is cut there. And the normal of the face or plane the ray begins at, 0 at the eye.
+var<private> surface_is_cut: bool;
+var<private> cut_normal: vec3f;
 
 // Draws a channel from what was found.
 fn draw_from(channel: u32, here: Source) {
@@ -389,6 +394,22 @@ fn sampled_at(channel: u32, number: f32, ahead: f32, step: f32) -> vec4f {
     return vec4f(0.0);
 }
 
+fn largest_of(color: vec3f) -> f32 {
+    return max(color.r, max(color.g, color.b));
+}
+
+// The colour of a channel's surface: of its value, but bright enough to be seen; in the hue of the brighter end of the table where
+// its own is black.
+fn surface_color(channel: u32) -> vec3f {
+    let own = color_of(channel, channel_of(channel).iso).rgb;
+    let low = textureLoad(colors, vec2u(1u, channel), 0).rgb;
+    let high = textureLoad(colors, vec2u(TABLE_LEN - 1u, channel), 0).rgb;
+    let end = select(low, high, largest_of(high) >= largest_of(low));
+    let hue = select(end, own, largest_of(own) > 1e-3);
+    let bright = hue * (SURFACE_LIGHT / max(largest_of(hue), 1e-6));
+    return select(bright, own, largest_of(own) >= SURFACE_LIGHT);
+}
+
 // Light from the surface that ended the ray: as bright as it faces the eye.
 fn lit_surface(ray: vec3f) -> vec3f {
     let x = vec3f(0.5, 0.0, 0.0) * texel;
@@ -401,10 +422,12 @@ fn lit_surface(ray: vec3f) -> vec3f {
         stored_at(at + z) - stored_at(at - z),
     );
     let gradient = slope * frame.levels[surface_level].voxels_per_nm;
-    let facing = abs(dot(gradient, ray)) / max(length(gradient) * length(ray), 1e-30);
+    // What is cut shows the cut: how values change there is no shape.
+    let normal = select(gradient, cut_normal, surface_is_cut);
+    let facing = abs(dot(normal, ray)) / max(length(normal) * length(ray), 1e-30);
     // Where values do not change there is no surface to light: as if it faced the eye.
-    let diffuse = select(facing, 1.0, length(gradient) <= 1e-30);
-    let color = color_of(surface, channel_of(surface).iso).rgb;
+    let diffuse = select(facing, 1.0, length(normal) <= 1e-30);
+    let color = surface_color(surface);
     return false_color(color, surface_level, surface_wanted) * (0.15 + 0.85 * diffuse);
 }
 
@@ -425,8 +448,11 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
     let ray = frame.forward + from_middle.x * frame.right + from_middle.y * frame.down;
     let nm_per_depth = length(ray);
     var depths = box_depths(frame.low_nm, frame.high_nm, ray);
+    cut_normal = entered_face(frame.low_nm, frame.high_nm, ray);
     for (var p = 0u; p < MOST_PLANES; p += 1u) {
+        let before = depths.x;
         depths = clipped_depths(depths, frame.planes[p], ray);
+        cut_normal = select(cut_normal, frame.planes[p].xyz, depths.x > before);
     }
     let urgency = 1.0 + dot(from_middle, from_middle);
     let sample_at = select(0.5, pixel_noise(pixel), has_flag(FLAG_JITTER));
@@ -668,6 +694,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                                 transmitted = through;
                             }
                             if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
+                                surface_is_cut = segments == 0u && i == 0.0;
                                 surface_light = transmitted;
                                 transmitted = 0.0;
                             }

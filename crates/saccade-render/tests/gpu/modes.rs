@@ -152,6 +152,25 @@ fn surfaces_are_where_values_pass() {
     }
 }
 
+/// Of values that are nearly black, and of matter that is cut through.
+#[test]
+fn surfaces_of_low_values_and_cuts_are_lit() {
+    let Some(gpu) = gpu() else { return };
+    for (name, mut scene) in [("waves", waves()), ("stained", stained())] {
+        scene.iso = 4.0;
+        let [view, _] = views(&scene);
+        for (which, clip) in clips(&scene) {
+            let view = View {
+                mode: Mode::IsoSurface,
+                clip,
+                ..view
+            };
+            let name = format!("low-surface-{name}-{which}");
+            compare(&gpu, &name, &scene, &view, 30.0);
+        }
+    }
+}
+
 #[test]
 fn surfaces_move_with_their_value() {
     let Some(gpu) = gpu() else { return };

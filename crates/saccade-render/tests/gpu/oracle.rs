@@ -51,7 +51,7 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
     let channels: Vec<&Scene> = scene.channels().collect();
     let mut largest = vec![0.0_f64; channels.len()];
     let mut before = vec![0.0_f64; channels.len()];
-    if let Some((near, far)) = clipped(scene, view, eye, ray) {
+    if let Some((near, far, face)) = clipped(scene, view, eye, ray) {
         let mut start = near;
         while start < far && transmitted > 0.0 {
             let level = level_at(scene, view, ray, start);
@@ -94,7 +94,13 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
                 }
                 Mode::IsoSurface => {
                     if let Some((hit, index)) = surface {
-                        light = lit(channels[index], level, eye + ray * hit, ray);
+                        // What begins where the ray does is cut there.
+                        let normal = if start == near {
+                            face
+                        } else {
+                            gradient(channels[index], level, eye + ray * hit)
+                        };
+                        light = lit(channels[index], normal, ray);
                         transmitted = 0.0;
                     }
                 }
@@ -127,24 +133,44 @@ fn stored_iso(scene: &Scene) -> f64 {
     }
 }
 
-/// A surface lit from the eye.
-fn lit(scene: &Scene, level: usize, at: DVec3, ray: DVec3) -> [f64; 3] {
+fn gradient(scene: &Scene, level: usize, at: DVec3) -> DVec3 {
     let voxel = scene.volume.voxel_nm * scene.volume.levels[level].downsampling;
     let slope = |axis: DVec3| {
         let value = |sign: f64| interpolated(scene, level, at / voxel + axis * sign * 0.5);
         value(1.0) - value(-1.0)
     };
-    let gradient = DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z)) / voxel;
-    let facing = gradient
-        .normalize_or_zero()
-        .dot(ray.normalize_or_zero())
-        .abs();
-    let [r, g, b, _] = color(scene, stored_iso(scene));
-    [r, g, b].map(|color| color * (0.15 + 0.85 * facing))
+    DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z)) / voxel
 }
 
-/// The part of a ray that is in the volume and not clipped.
-fn clipped(scene: &Scene, view: &View, eye: DVec3, ray: DVec3) -> Option<(f64, f64)> {
+/// A surface lit from the eye; one without a direction as if it faced it.
+fn lit(scene: &Scene, normal: DVec3, ray: DVec3) -> [f64; 3] {
+    let facing = match normal.try_normalize() {
+        Some(normal) => normal.dot(ray.normalize_or_zero()).abs(),
+        None => 1.0,
+    };
+    surface_color(scene).map(|color| color * (0.15 + 0.85 * facing))
+}
+
+/// The colour of the surface's value, half as bright as can be at least; that of the brighter end of the map where it
+/// is black.
+pub(crate) fn surface_color(scene: &Scene) -> [f64; 3] {
+    let rgb = |stored| {
+        let [r, g, b, _] = color(scene, stored);
+        [r, g, b]
+    };
+    let most = |rgb: [f64; 3]| rgb.into_iter().fold(0.0, f64::max);
+    let own = rgb(stored_iso(scene));
+    if most(own) >= 0.5 {
+        return own;
+    }
+    let (low, high) = (rgb(1.0), rgb(255.0));
+    let end = if most(high) >= most(low) { high } else { low };
+    let hue = if most(own) > 1e-3 { own } else { end };
+    hue.map(|part| part * 0.5 / most(hue).max(1e-6))
+}
+
+/// The part of a ray that is in the volume and not clipped, and the normal of the face it enters through; zero if the eye is inside.
+fn clipped(scene: &Scene, view: &View, eye: DVec3, ray: DVec3) -> Option<(f64, f64, DVec3)> {
     let size = scene.volume.size_nm();
     let [low, high] = match view.clip.within {
         Some([a, b]) => [
@@ -153,11 +179,13 @@ fn clipped(scene: &Scene, view: &View, eye: DVec3, ray: DVec3) -> Option<(f64, f
         ],
         None => [DVec3::ZERO, size],
     };
-    let (mut near, mut far) = slab(eye - low, ray, high - low)?;
+    let (mut near, mut far, mut face) = slab(eye - low, ray, high - low)?;
     let mut keep = |point: DVec3, normal: DVec3| {
         let (approach, distance) = (normal.dot(ray), normal.dot(point - eye));
         if approach > 0.0 {
-            near = near.max(distance / approach);
+            if distance / approach > near {
+                (near, face) = (distance / approach, normal);
+            }
         } else if approach < 0.0 {
             far = far.min(distance / approach);
         } else if distance > 0.0 {
@@ -173,12 +201,12 @@ fn clipped(scene: &Scene, view: &View, eye: DVec3, ray: DVec3) -> Option<(f64, f
         keep(slab.point.xyz - half, normal);
         keep(slab.point.xyz + half, -normal);
     }
-    (near < far).then_some((near, far))
+    (near < far).then_some((near, far, face))
 }
 
-/// Where the ray is between all three pairs of faces, in front of the eye.
-fn slab(eye: DVec3, ray: DVec3, size: DVec3) -> Option<(f64, f64)> {
-    let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+/// Where the ray is between all three pairs of faces, in front of the eye, and the axis of the face it enters through.
+fn slab(eye: DVec3, ray: DVec3, size: DVec3) -> Option<(f64, f64, DVec3)> {
+    let (mut near, mut far, mut face) = (0.0_f64, f64::INFINITY, DVec3::ZERO);
     for axis in 0..3 {
         if ray[axis] == 0.0 {
             if eye[axis] < 0.0 || eye[axis] > size[axis] {
@@ -188,10 +216,12 @@ fn slab(eye: DVec3, ray: DVec3, size: DVec3) -> Option<(f64, f64)> {
         }
         let a = -eye[axis] / ray[axis];
         let b = (size[axis] - eye[axis]) / ray[axis];
-        near = near.max(a.min(b));
+        if a.min(b) > near {
+            (near, face) = (a.min(b), DVec3::AXES[axis]);
+        }
         far = far.min(a.max(b));
     }
-    (near < far).then_some((near, far))
+    (near < far).then_some((near, far, face))
 }
 
 /// The level whose voxels are nearest to a pixel in size, by ratio.
@@ -340,7 +370,7 @@ mod tests {
             128.0 + 8.0 * (radius / 4.0 - (at - 32.0).length())
         });
         scene.iso = 128.0;
-        let [own, ..] = color(&scene, 128.0);
+        let [own, ..] = surface_color(&scene);
         for off in [0.0, 30.0, 55.0, 70.0] {
             let at = DVec2::new(128.0 + off * 0.6, 128.0 - off * 0.8);
             let deep = f64::sqrt(radius * radius - off * off);
@@ -359,6 +389,35 @@ mod tests {
                 assert_eq!(seen[2] < 0.9, met, "{off} nm off, up to {end} nm: {seen:?}");
             }
         }
+    }
+
+    /// What is cut through is as bright as the cut faces the eye, whatever the values there.
+    #[test]
+    fn a_cut_is_lit_as_a_plane() {
+        let transfer = ramp(Polarity::Bright, ColorMap::Green, &[(0.0, 1.0)], 100.0);
+        let mut scene = cube(transfer, |at| {
+            let noise = at.floor().dot(DVec3::new(17.0, 29.0, 71.0)) % 13.0;
+            60.0 + 10.0 * noise
+        });
+        // Nearly black in its own colour.
+        scene.iso = 3.0;
+        let clip = Clip {
+            half_spaces: [
+                Some(saccade_render::HalfSpace {
+                    point: Point::new(DVec3::splat(128.0)),
+                    normal: DVec3::new(1.0, 0.0, 2.0),
+                }),
+                None,
+                None,
+                None,
+            ],
+            ..Clip::default()
+        };
+        let facing = 2.0 / 5.0_f64.sqrt();
+        let [red, green, _] = light_at(&scene, DVec2::splat(128.0), Mode::IsoSurface, clip);
+        let want = 0.5 * (0.15 + 0.85 * facing);
+        assert!((green - want).abs() < 0.01, "{green}, not {want}");
+        assert!(red < 0.01, "{red}");
     }
 
     #[test]

@@ -15,6 +15,15 @@ fn box_depths(low: vec3f, high: vec3f, ray: vec3f) -> vec2f {
     return vec2f(max(max(near.x, near.y), max(near.z, 0.0)), min(far.x, min(far.y, far.z)));
 }
 
+// The axis of the face through which a ray enters a box; none if it starts inside.
+fn entered_face(low: vec3f, high: vec3f, ray: vec3f) -> vec3f {
+    let inverse = 1.0 / divisible(ray);
+    let near = min(low * inverse, high * inverse);
+    let first = max(max(near.x, near.y), near.z);
+    let face = select(select(vec3f(0.0, 0.0, 1.0), vec3f(0.0, 1.0, 0.0), near.y == first), vec3f(1.0, 0.0, 0.0), near.x == first);
+    return select(vec3f(0.0), face, first > 0.0);
+}
+
 // The part of `depths` on the side of a plane where dot(plane.xyz, position) + plane.w >= 0.
 fn clipped_depths(depths: vec2f, plane: vec4f, ray: vec3f) -> vec2f {
     let approach = dot(plane.xyz, ray);
