@@ -33,10 +33,12 @@ const WIDE_ENOUGH: f64 = 2.0;
 
 /// Text that names no camera.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("camera {text:?} is not yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres")]
+#[error("camera {text:?} is not yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres: {wrong}")]
 pub struct ParseCameraError {
     /// As given.
     pub text: String,
+    /// What is wrong with it, and what would do.
+    pub wrong: &'static str,
 }
 
 impl Camera {
@@ -180,19 +182,26 @@ impl fmt::Display for Camera {
 impl FromStr for Camera {
     type Err = ParseCameraError;
     fn from_str(text: &str) -> Result<Self, ParseCameraError> {
-        let error = || ParseCameraError {
+        let error = |wrong| ParseCameraError {
             text: text.to_owned(),
+            wrong,
         };
-        let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
-        let numbers = numbers.map_err(|_| error())?;
+        let numbers = text.split(',').map(|n| n.trim().parse().ok());
+        let numbers: Option<Vec<f64>> = numbers.map(|n| n.filter(|n| f64::is_finite(*n))).collect();
+        let numbers = numbers.ok_or_else(|| error("one of them is no number"))?;
         let (yaw, pitch, distance_nm, target, fov) = match numbers[..] {
             [yaw, pitch, distance, x, y, z] => (yaw, pitch, distance, [x, y, z], Self::FOV),
             [yaw, pitch, distance, x, y, z, fov] => (yaw, pitch, distance, [x, y, z], fov),
-            _ => return Err(error()),
+            _ => return Err(error("give six numbers or seven, with commas")),
         };
-        let finite = numbers.iter().all(|n| n.is_finite());
-        if !finite || distance_nm <= 0.0 || pitch.abs() > 90.0 || !(fov > 0.0 && fov < 180.0) {
-            return Err(error());
+        if pitch.abs() > 90.0 {
+            return Err(error("the pitch goes from -90 to 90"));
+        }
+        if distance_nm <= 0.0 {
+            return Err(error("the distance has to be above 0"));
+        }
+        if !(fov > 0.0 && fov < 180.0) {
+            return Err(error("the fov has to be above 0 and below 180"));
         }
         Ok(Self {
             target: Point::new(target.into()),
@@ -337,15 +346,19 @@ mod tests {
     fn text_survives() {
         let camera = Camera::around(&volume()).orbited(11.5, -3.0);
         assert_eq!(camera.to_string().parse::<Camera>().unwrap(), camera);
-        for bad in [
-            "",
-            "1,2,3",
-            "0,0,-5,0,0,0",
-            "0,0,inf,0,0,0",
-            "0,99,1,0,0,0",
-            "0,0,1,0,0,0,180",
+        for (bad, told) in [
+            ("", "no number"),
+            ("1,2,3", "six numbers or seven"),
+            ("1,2,3,4,5,6,7,8", "six numbers or seven"),
+            ("0,0,-5,0,0,0", "distance"),
+            ("0,0,inf,0,0,0", "no number"),
+            ("0,0,1,0,x,0", "no number"),
+            ("0,99,1,0,0,0", "from -90 to 90"),
+            ("0,0,1,0,0,0,180", "above 0 and below 180"),
+            ("0,0,1,0,0,0,0", "above 0 and below 180"),
         ] {
-            assert!(bad.parse::<Camera>().is_err(), "{bad:?}");
+            let error = bad.parse::<Camera>().unwrap_err().to_string();
+            assert!(error.contains(told), "{bad:?}: {error}");
         }
     }
 

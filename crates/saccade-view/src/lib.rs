@@ -57,7 +57,7 @@ mod web;
 pub use acquisition::AcquisitionReader;
 pub use detail::details_from_text;
 pub use options::{
-    BackgroundError, OptionsError, ViewOptions, background_from_text, gpu_memory_from_text,
+    AskedWith, BackgroundError, OptionsError, ViewOptions, background_from_text, gpu_memory_from_text,
     host_memory_from_text,
 };
 pub use page::{PageError, PageOptions};

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use glam::UVec2;
+use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{TransferFunction, linear_from_srgb};
 use saccade_core::volume::Volume;
@@ -11,6 +11,7 @@ use saccade_source::VolumeSource;
 use saccade_stream::policy::Limits;
 use saccade_stream::{Detail, Session, SessionError, SessionOptions, Wake};
 
+use crate::detail::text_of;
 use crate::shown::{OutsideError, Shown, ShownError};
 
 /// What the application opens with. Where something is said of channels, `None` stands for all of them, and later words
@@ -58,6 +59,31 @@ impl Default for ViewOptions {
             ui: true,
             gpu_bytes: 512 << 20,
             limits: Limits::default(),
+        }
+    }
+}
+
+/// What people say how a volume is shown with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum AskedWith {
+    /// `--mode surface`.
+    CommandLine,
+    /// `mode=surface`.
+    Address,
+}
+
+impl AskedWith {
+    fn option(self, name: &str) -> String {
+        match self {
+            Self::CommandLine => format!("--{name}"),
+            Self::Address => format!("{name}="),
+        }
+    }
+
+    fn choice(self, name: &str, value: &str) -> String {
+        match self {
+            Self::CommandLine => format!("--{name} {value}"),
+            Self::Address => format!("{name}={value}"),
         }
     }
 }
@@ -149,42 +175,78 @@ impl ViewOptions {
         Ok(session)
     }
 
-    /// What was asked for and does not show in the first picture, in sentences that name the command line's options.
-    pub fn without_effect(&self, volume: &Volume) -> Vec<String> {
+    /// What was asked for and does not show in the first picture, in sentences that name what was asked with.
+    pub fn without_effect(&self, volume: &Volume, with: AskedWith) -> Vec<String> {
         let mut told = Vec::new();
+        let option = |name| with.option(name);
         let shown = &self.shown;
         let surfaces = shown.drawn_mode() == Mode::IsoSurface;
         if shown.mode == Mode::IsoSurface && !surfaces {
-            told.push(
-                "--mode surface does not show in a plane alone, which has values as they are: --slab gives it a thickness"
-                    .to_owned(),
-            );
+            told.push(format!(
+                "{} does not show in a plane alone, which has values as they are: {} gives it a thickness",
+                with.choice("mode", "surface"),
+                option("slab")
+            ));
         } else if !self.isos.is_empty() && !surfaces {
-            told.push(
-                "--iso shows where surfaces are drawn: add --mode surface, or leave it out"
-                    .to_owned(),
-            );
+            told.push(format!(
+                "{} shows where surfaces are drawn: add {}, or leave it out",
+                option("iso"),
+                with.choice("mode", "surface")
+            ));
         }
         if shown.heat.is_some() && self.false_colors != FalseColors::None {
-            told.push(
-                "--false-colors does not show with --heat, which draws the work of rays instead"
-                    .to_owned(),
-            );
+            told.push(format!(
+                "{} does not show with {}, which draws the work of rays instead",
+                option("false-colors"),
+                option("heat")
+            ));
+        }
+        if shown.slab_nm > 0.0 && shown.slice.is_none() {
+            told.push(format!(
+                "{} shows around a plane: add {}, or leave it out",
+                option("slab"),
+                option("slice")
+            ));
+        }
+        for cut in shown.cuts.iter().flatten() {
+            let whole = [DVec3::ZERO, volume.extent().as_dvec3()];
+            if cut.range_of(volume, whole)[0] >= 0.0 {
+                let DVec3 { x, y, z } = whole[1];
+                told.push(format!(
+                    "{} takes nothing away: its plane is outside of the volume of {x} x {y} x {z} voxels, or in a face, and what its \
+                     normal points to stays",
+                    option("cut")
+                ));
+            }
         }
         let seen = self.channels.clone();
         let seen = seen.unwrap_or_else(|| saccade_stream::shown_at_first(volume));
         let isos = self.isos.iter().filter(|_| surfaces);
-        let named = (self.transfers.iter().map(|(of, _)| ("--transfer", *of)))
-            .chain(self.details.iter().map(|(of, _)| ("--detail", *of)))
-            .chain(isos.map(|(of, _)| ("--iso", *of)));
-        for (option, of) in named {
+        let named = (self.transfers.iter().map(|(of, _)| ("transfer", *of)))
+            .chain(self.details.iter().map(|(of, _)| ("detail", *of)))
+            .chain(isos.map(|(of, _)| ("iso", *of)));
+        for (name, of) in named {
             if let Some(channel) = of
                 && !seen.contains(&channel)
             {
                 told.push(format!(
-                    "{option} of channel {channel} does not show, nor does that channel: name it with --channels"
+                    "{} of channel {channel} does not show, nor does that channel: name it with {}",
+                    option(name),
+                    option("channels")
                 ));
             }
+        }
+        let last = u32::try_from(volume.levels.len().saturating_sub(1)).unwrap_or(u32::MAX);
+        let beyond = self.details.iter().filter(|(_, detail)| match detail {
+            Detail::Chosen { levels, coarser } => *levels.start() > last || *coarser > last,
+            Detail::Full | Detail::ByContent => false,
+        });
+        for (_, detail) in beyond {
+            told.push(format!(
+                "{} {} asks for levels that this volume does not have: it has 0 to {last}, and is drawn from level {last}",
+                option("detail"),
+                text_of(detail)
+            ));
         }
         let transfers =
             { self.transfers.iter() }.filter_map(|(of, transfer)| Some((of, transfer.as_ref()?)));
@@ -195,11 +257,13 @@ impl ViewOptions {
                 && transfer.opacity.iter().all(|point| point.opacity <= 0.0)
             {
                 told.push(format!(
-                    "--transfer{of} is transparent everywhere, so that nothing of it shows: give it points of \"opacity\" above 0"
+                    "{}{of} is transparent everywhere, so that nothing of it shows: give it points of \"opacity\" above 0",
+                    option("transfer")
                 ));
             } else if low.min(high) >= 1.0 || low.max(high) <= 0.0 {
                 told.push(format!(
-                    "--transfer{of} has a window beyond all values, which are 0 to 1, so that all of them have one colour"
+                    "{}{of} has a window beyond all values, which are 0 to 1, so that all of them have one colour",
+                    option("transfer")
                 ));
             }
         }
@@ -413,9 +477,11 @@ mod tests {
     #[test]
     fn what_does_not_show_is_told() {
         let size = glam::UVec3::new(90, 80, 70);
-        let mut volume = Volume::new("v", size, glam::DVec3::ONE).unwrap();
+        let mut volume = Volume::new("v", size, DVec3::ONE).unwrap();
         volume.channels = (0..6).map(|n| n.to_string()).collect();
-        let told = |options: &ViewOptions| options.without_effect(&volume).join("\n");
+        let asked_with =
+            |options: &ViewOptions, with| options.without_effect(&volume, with).join("\n");
+        let told = |options: &ViewOptions| asked_with(options, AskedWith::CommandLine);
         let surface = Shown {
             mode: Mode::IsoSurface,
             ..Shown::default()
@@ -454,15 +520,71 @@ mod tests {
         assert_eq!(told(&options), "");
         options.shown.heat = crate::shown::heat_from_text("nodes").ok();
         assert!(told(&options).contains("--heat"));
+        // In the words of a page's address.
+        options.isos = vec![(None, 0.5)];
+        let address = asked_with(&options, AskedWith::Address);
+        for part in [
+            "iso= shows",
+            "add mode=surface",
+            "false-colors= does",
+            "with heat=",
+        ] {
+            assert!(address.contains(part), "{part}: {address}");
+        }
+        assert!(!address.contains("--"), "{address}");
+        options = ViewOptions::default();
+        options.shown.slab_nm = 40.0;
+        let address = asked_with(&options, AskedWith::Address);
+        assert!(address.starts_with("slab= ") && address.contains("slice="));
+    }
+
+    #[test]
+    fn levels_and_cuts_beyond_the_volume_are_told() {
+        let size = glam::UVec3::new(90, 80, 70);
+        let volume = Volume::new("v", size, DVec3::ONE).unwrap();
+        let told = |options: &ViewOptions| {
+            { options.without_effect(&volume, AskedWith::CommandLine) }.join("\n")
+        };
+        assert_eq!(volume.levels.len(), 3);
+        let with = |detail: &str| {
+            told(&ViewOptions {
+                details: crate::details_from_text(detail).unwrap(),
+                ..ViewOptions::default()
+            })
+        };
+        for fits in ["full", "content", "2", "2-", "0-9", "1-2+2", "0:2-7"] {
+            assert_eq!(with(fits), "", "{fits}");
+        }
+        for (beyond, as_text) in [
+            ("7-9", "7-9"),
+            ("3-", "3-"),
+            ("9", "9"),
+            ("0:1-2+3", "1-2+3"),
+        ] {
+            let said = with(beyond);
+            let parts = [format!("--detail {as_text} "), "0 to 2".to_owned()];
+            assert!(parts.iter().all(|part| said.contains(part)), "{said}");
+        }
+        let cut = |text: &str| {
+            let mut options = ViewOptions::default();
+            assert!(options.shown.cut(crate::plane_from_text(text).unwrap()));
+            told(&options)
+        };
+        for cuts in ["z=1", "x=89", "0,0,-1@0,0,69", "1,1,1@1,0,0"] {
+            assert_eq!(cut(cuts), "", "{cuts}");
+        }
+        for idle in ["z=0", "y=-3", "0,0,-1@0,0,70", "1,1,1@0,0,0"] {
+            assert!(cut(idle).contains("90 x 80 x 70"), "{idle}");
+        }
     }
 
     #[test]
     fn transfer_functions_that_show_nothing_are_told() {
         let size = glam::UVec3::new(90, 80, 70);
-        let volume = Volume::new("v", size, glam::DVec3::ONE).unwrap();
+        let volume = Volume::new("v", size, DVec3::ONE).unwrap();
         let with = |window: [f32; 2], opacities: &[f32], mode: Mode| {
             let mut transfer =
-                saccade_core::transfer::Histogram::default().transfer_function(glam::DVec3::ONE);
+                saccade_core::transfer::Histogram::default().transfer_function(DVec3::ONE);
             transfer.window = window;
             let points = opacities
                 .iter()
@@ -479,7 +601,7 @@ mod tests {
                 },
                 ..ViewOptions::default()
             };
-            options.without_effect(&volume).join("\n")
+            { options.without_effect(&volume, AskedWith::CommandLine) }.join("\n")
         };
         for opacities in [&[][..], &[0.0], &[0.0, 0.0]] {
             assert!(with([0.0, 1.0], opacities, Mode::EmissionAbsorption).contains("transparent"));
@@ -498,7 +620,7 @@ mod tests {
     #[test]
     fn what_the_volume_does_not_have_is_refused() {
         let size = glam::UVec3::new(90, 80, 70);
-        let mut volume = Volume::new("v", size, glam::DVec3::ONE).unwrap();
+        let mut volume = Volume::new("v", size, DVec3::ONE).unwrap();
         volume.channels = vec!["a".to_owned(), "b".to_owned()];
         let check = |options: ViewOptions| options.check(&volume).map_err(|e| e.to_string());
         for channel in [0, 1, 2, 9] {

@@ -66,6 +66,13 @@ impl Plane {
         (volume.size_nm() / 2.0).dot(normal.abs())
     }
 
+    /// Between which distances along the normal a box lies \[level-0 voxels, then nm\].
+    pub(crate) fn range_of(&self, volume: &Volume, corners: [DVec3; 2]) -> [f64; 2] {
+        let normal = self.normal.normalize_or_zero();
+        let [a, b] = corners.map(|corner| (corner - self.point) * volume.voxel_nm * normal);
+        [a.min(b).element_sum(), a.max(b).element_sum()]
+    }
+
     fn physical(&self, volume: &Volume) -> Point<saccade_core::space::Physical> {
         Point::new(self.point * volume.voxel_nm)
     }

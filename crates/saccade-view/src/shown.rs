@@ -241,6 +241,27 @@ pub enum OutsideError {
         /// Where it ends.
         high: f64,
     },
+    /// A plane cuts away all of it.
+    #[error(
+        "the cut {axis}={at} leaves nothing: along {axis}, what can be seen ends at {end}; give less"
+    )]
+    Cut {
+        /// x, y or z.
+        axis: &'static str,
+        /// As given \[level-0 voxels\].
+        at: f64,
+        /// Where what can be seen ends.
+        end: f64,
+    },
+    /// An oblique plane cuts away all of it.
+    #[error(
+        "a cut leaves nothing: its normal points away from what can be seen, which ends {away:.0} nm before the plane; \
+         turn the normal around, or give a point inside the volume"
+    )]
+    ObliqueCut {
+        /// How far from the plane what can be seen is \[nm\].
+        away: f64,
+    },
 }
 
 impl Shown {
@@ -277,7 +298,7 @@ impl Shown {
             }
         }
         let Some([one, other]) = self.within else {
-            return Ok(());
+            return self.check_cuts(volume, [low, high]);
         };
         let (min, max) = (one.min(other), one.max(other));
         for axis in 0..3 {
@@ -295,6 +316,27 @@ impl Shown {
                     high: high[axis],
                 });
             }
+        }
+        self.check_cuts(volume, [low.max(min), high.min(max)])
+    }
+
+    /// Refuses planes that leave nothing of a box \[level-0 voxels\].
+    fn check_cuts(&self, volume: &Volume, [low, high]: [DVec3; 2]) -> Result<(), OutsideError> {
+        // A plane alone may lie in the cut.
+        let is_thin = low.cmpeq(high).any();
+        for cut in self.cuts.iter().flatten() {
+            let left = cut.range_of(volume, [low, high])[1];
+            if left > 0.0 || (is_thin && left == 0.0) {
+                continue;
+            }
+            return Err(match cut.axis() {
+                Some((axis, at)) => OutsideError::Cut {
+                    axis: AXES[axis],
+                    at,
+                    end: high[axis],
+                },
+                None => OutsideError::ObliqueCut { away: -left },
+            });
         }
         Ok(())
     }
@@ -329,7 +371,7 @@ mod tests {
     use glam::UVec3;
 
     use super::*;
-    use crate::plane::slice_from_text;
+    use crate::plane::{plane_from_text, slice_from_text};
 
     #[test]
     fn text_names_what_is_shown() {
@@ -412,6 +454,41 @@ mod tests {
         assert!(told.contains("distance of 78 nm"), "{told}");
         assert_eq!(check(Some("z=5"), Some("0,0,5,9,9,9")), Ok(()));
         assert!(check(Some("z=4"), Some("0,0,5,9,9,9")).is_err());
+    }
+
+    #[test]
+    fn cuts_that_leave_nothing_are_refused() {
+        let volume = Volume::new("v", UVec3::new(90, 80, 70), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+        let check = |cut: &str, slice: Option<&str>, within: Option<&str>| {
+            let mut shown = Shown {
+                slice: slice.map(|text| slice_from_text(text).unwrap()),
+                within: within.map(|text| box_from_text(text).unwrap()),
+                ..Shown::default()
+            };
+            assert!(shown.cut(plane_from_text(cut).unwrap()));
+            shown.check(&volume).map_err(|error| error.to_string())
+        };
+        for good in ["z=69.5", "z=-5", "x=0", "-1,0,0@3,0,0", "1,1,0@89,80,0"] {
+            assert_eq!(check(good, None, None), Ok(()), "{good}");
+        }
+        // At the far face there is nothing left.
+        for at in [70.0, 71.0, 900.0] {
+            let told = check(&format!("z={at}"), None, None).unwrap_err();
+            let parts = [format!("z={at} "), "ends at 70;".to_owned()];
+            assert!(parts.iter().all(|part| told.contains(part)), "{told}");
+        }
+        for bad in ["-1,0,0@0,0,0", "1,1,0@90,81,0"] {
+            assert!(check(bad, None, None).is_err(), "{bad}");
+        }
+        let told = check("0,0,-1@0,0,-2", None, None).unwrap_err();
+        assert!(told.contains("80 nm before"), "{told}");
+        // What the box and the plane leave counts.
+        let part = Some("10,10,10,20,20,20");
+        assert_eq!(check("z=19", None, part), Ok(()));
+        assert!(check("z=20", None, part).unwrap_err().contains("at 20"));
+        assert_eq!(check("z=40", Some("z=40"), None), Ok(()));
+        assert_eq!(check("z=40.5", Some("z=40"), None), Ok(()), "in the plane");
+        assert!(check("z=41", Some("z=40"), None).is_err());
     }
 
     #[test]

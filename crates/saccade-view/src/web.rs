@@ -14,6 +14,7 @@ use web_sys::HtmlCanvasElement;
 use crate::acquisition::{AcquisitionReader, from_server};
 use crate::app::Surroundings;
 use crate::handover::Handover;
+use crate::options::AskedWith;
 use crate::page::PageOptions;
 use crate::setup::wgpu_options;
 
@@ -86,6 +87,11 @@ async fn run(canvas_id: &str) -> Result<(), String> {
     };
     let there = page.view.check(opened.source.volume());
     there.map_err(|error| format!("The page's address asks for what is not there: {error}."))?;
+    let mut notes = opened.notes;
+    notes.extend(
+        page.view
+            .without_effect(opened.source.volume(), AskedWith::Address),
+    );
 
     let (tell, losses) = mpsc::unbounded();
     let surroundings = Surroundings {
@@ -95,7 +101,7 @@ async fn run(canvas_id: &str) -> Result<(), String> {
             let _ = tell.unbounded_send(may_revive);
         }),
         acquisition: opened.acquisition,
-        notes: opened.notes,
+        notes,
         open: Some(Box::new(go_to_image)),
     };
     let drawn = Drawn {

@@ -42,8 +42,9 @@ fn channels(text: &str) -> Result<Channels, ShownError> {
 /// How a volume is shown.
 #[derive(Args)]
 pub(crate) struct Looks {
-    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres [default: the whole
-    /// volume]
+    /// From where: yaw,pitch,distance,x,y,z[,fov] in degrees and nanometres; pitch from -90 to 90, distance above
+    /// 0, fov above 0 and below 180, 35 if not told; x,y,z is what is looked at, from the volume's corner
+    /// [default: the whole volume]
     #[arg(long, allow_hyphen_values = true)]
     camera: Option<Camera>,
 
@@ -75,8 +76,8 @@ pub(crate) struct Looks {
     #[arg(long, value_name = "NM", value_parser = thickness_from_text, default_value = "0", requires = "slice")]
     slab: f64,
 
-    /// Cut away what the normal of a plane does not point to; planes as with --slice, but z=40 lies before voxel 40;
-    /// up to four times [default: nothing]
+    /// Cut away what the normal of a plane does not point to; planes as with --slice, but z=40 lies before voxel 40,
+    /// so that voxels from 40 on stay; 0,0,-1@0,0,40 keeps those before; up to four times [default: nothing]
     #[arg(long, value_name = "PLANE", value_parser = plane_from_text, allow_hyphen_values = true)]
     cut: Vec<Plane>,
 
@@ -92,7 +93,8 @@ pub(crate) struct Looks {
 
     /// How finely channels are drawn: full, content (no level that differs by less than a hundredth from the next
     /// coarser one), levels coarser than the view asks for, as in 2, or the levels that are drawn, 0 the finest, as
-    /// in 1-4, 1- or 1-4+1 (one coarser than the view asks for); for all channels, or each as in 0:full,2:1-4+1
+    /// in 1-4, 1- or 1-4+1 (one coarser than the view asks for), the coarsest of the volume where it has none of them;
+    /// for all channels, or each as in 0:full,2:1-4+1
     #[arg(long, value_name = "DETAIL,...", value_parser = details, default_value = "full")]
     detail: Details,
 

@@ -8,6 +8,7 @@ use clap::Args;
 use glam::UVec2;
 use saccade_render::Gpu;
 use saccade_stream::{SessionOptions, SettleError, Status};
+use saccade_view::AskedWith;
 
 use crate::arguments::{CatalogArgument, picture, picture_size, seconds};
 use crate::looks::Looks;
@@ -63,7 +64,7 @@ impl Render {
             .await?;
         let source = opened.source;
         options.check(source.volume())?;
-        for sentence in options.without_effect(source.volume()) {
+        for sentence in options.without_effect(source.volume(), AskedWith::CommandLine) {
             say(&sentence);
         }
         let gpu = Gpu::headless().await?;
