@@ -196,6 +196,28 @@ pub enum AcquisitionError {
     },
 }
 
+impl AcquisitionError {
+    /// The file or folder that it is about.
+    pub fn path(&self) -> &Path {
+        match self {
+            Self::Read { path, .. }
+            | Self::Write { path, .. }
+            | Self::NoInfo { path }
+            | Self::Info { path, .. }
+            | Self::Key { path, .. }
+            | Self::Channels { path, .. }
+            | Self::LeadsOut { path }
+            | Self::RecordsCut { path, .. }
+            | Self::RecordsReplaced { path, .. }
+            | Self::Utf16 { path }
+            | Self::Line { path, .. }
+            | Self::Json { path, .. }
+            | Self::Tile { path, .. }
+            | Self::Xml { path, .. } => path,
+        }
+    }
+}
+
 /// What is acquired: the content of `volume.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AcquisitionInfo {

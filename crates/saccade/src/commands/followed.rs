@@ -1,12 +1,15 @@
 //! What `saccade ingest` follows: records, or a folder whose file names or list say what lies where.
 
+use std::fs::Metadata;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 use glam::{DVec2, DVec3, UVec3};
 use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, refuse_link_out};
+use saccade_archive::clock::{Clock as _, SystemClock};
 use saccade_core::volume::Dtype;
 use saccade_ingest::ingest::IngestOptions;
 use saccade_ingest::replay::find_list;
@@ -84,6 +87,24 @@ pub(crate) struct Bare {
     bits: Option<u8>,
 }
 
+/// Whether what keeps a folder from being followed is a file that was written just now, and may not be whole yet.
+pub(crate) fn is_being_written(error: &anyhow::Error) -> bool {
+    /// For how long what is whole has not changed.
+    const SETTLED: Duration = Duration::from_secs(5);
+    let files = error.chain().filter_map(|cause| {
+        let shared = cause.downcast_ref::<Arc<AcquisitionError>>();
+        let found = { cause.downcast_ref() }.or(shared.map(AsRef::as_ref))?;
+        Some(AcquisitionError::path(found).to_owned())
+    });
+    let mut files = files.filter_map(|path| path.metadata().ok().filter(Metadata::is_file));
+    files.any(|file| {
+        let written = file.modified().ok();
+        // One of a time that is to come has not changed for long.
+        let ago = written.and_then(|at| SystemClock.now().duration_since(at).ok());
+        ago.is_some_and(|ago| ago < SETTLED)
+    })
+}
+
 /// What is followed.
 pub(crate) enum Followed {
     /// An acquisition archive.
@@ -138,14 +159,14 @@ impl Bare {
                     return Err(nothing.into());
                 };
                 let config = self.listed(list, name)?;
-                say(&format!(
-                    "the places are those of {}",
-                    config.list.display()
-                ));
                 // One that was followed before may be about to be mended.
                 if before.is_none() {
                     config.check()?;
                 }
+                say(&format!(
+                    "the places are those of {}",
+                    config.list.display()
+                ));
                 Ok(Followed::List(config))
             }
             Err(e) => Err(e.into()),

@@ -7,6 +7,7 @@ use anyhow::Result;
 use clap::Args;
 use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::catalog::Catalog;
+use saccade_archive::clock::{Clock as _, SystemClock};
 use saccade_archive::pyramid::{Encoding, PyramidIndex};
 use saccade_archive::{ArchiveLocation, CatalogLocation, VisualizationArchive};
 use saccade_core::volume::{Dtype, VoxelKind, check_name};
@@ -15,7 +16,7 @@ use saccade_ingest::watch::{self, Disk, ListWatch, Until, Watch};
 use saccade_ingest::{Cancel, HeldUp};
 use tokio::task::JoinHandle;
 
-use super::followed::{Bare, Followed};
+use super::followed::{Bare, Followed, is_being_written};
 use crate::arguments::{Archive, volume_name};
 use crate::folders::overlap;
 use crate::interrupt::cancel_when_interrupted;
@@ -292,6 +293,33 @@ impl Ingest {
         Ok(())
     }
 
+    /// What to follow; `None` if that was cancelled. What says it may be about to be written: it is read again, unless all
+    /// is said to be there.
+    async fn followed(
+        &self,
+        name: &str,
+        kept: Option<&Path>,
+        cancel: &Cancel,
+    ) -> Result<Option<Followed>> {
+        let mut said = false;
+        loop {
+            let error = match self.bare.followed(&self.acquisition, name, kept) {
+                Ok(followed) => return Ok(Some(followed)),
+                Err(error) if self.once || !is_being_written(&error) => return Err(error),
+                Err(error) => error,
+            };
+            if !std::mem::replace(&mut said, true) {
+                log::warn!(
+                    "{error:#}; it was written just now, and is read again in case it is not whole yet"
+                );
+            }
+            tokio::select! {
+                () = SystemClock.sleep(IngestOptions::DEFAULT.poll) => {}
+                () = cancel.cancelled() => return Ok(None),
+            }
+        }
+    }
+
     pub(crate) async fn run(self) -> Result<ExitCode> {
         // Before the archive is made: a wrong first folder should not leave a second one behind.
         let name = self
@@ -310,9 +338,10 @@ impl Ingest {
                 return Ok(ExitCode::SUCCESS);
             }
         }
-        let followed = self
-            .bare
-            .followed(&self.acquisition, &name, kept.as_deref())?;
+        let followed = self.followed(&name, kept.as_deref(), &cancel).await?;
+        let Some(followed) = followed else {
+            return Ok(ExitCode::SUCCESS);
+        };
         if let Some(folder) = location.folder() {
             refuse_same_folder(&self.acquisition, folder)?;
         }

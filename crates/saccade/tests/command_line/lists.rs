@@ -239,6 +239,46 @@ fn lines_that_name_an_image_again_are_told() {
     }
 }
 
+/// Somebody starts both at once.
+#[test]
+fn a_list_that_is_being_written_at_the_start_is_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    for name in ["a.png", "b.png"] {
+        picture(&scope, name, 10);
+    }
+    let list = scope.join("list.json");
+    let spec = |tile: &str, x: u32| {
+        serde_json::json!({
+            "tileId": tile, "z": 3, "width": 40, "height": 30,
+            "mipmapLevels": {"0": {"imageUrl": format!("{tile}.png")}},
+            "transforms": {"type": "list", "specList": [
+                {"className": "mpicbg.trakem2.transform.AffineModel2D", "dataString": format!("1 0 0 1 {x} 0")},
+            ]},
+        })
+    };
+    let specs = serde_json::json!([spec("a", 0), spec("b", 35)]).to_string();
+    std::fs::write(&list, &specs[..70]).unwrap();
+    let ingest = ["ingest", text(&scope), text(&archive), "--voxel", "4"];
+    let ingest = [&ingest[..], &["--list", text(&list)]].concat();
+    assert_failed(&run([&ingest[..], &["--once"]].concat()), 1, &["list.json"]);
+    let following = Program::start_with(&ingest, &[]);
+    let said = says(&following.stderr, "is read again in case it is not whole");
+    assert!(said.contains(text(&list)), "{said}");
+    std::fs::write(&list, &specs).unwrap();
+    says(&following.stderr, "the places are those of");
+
+    // What rests makes no sense to anybody.
+    std::fs::write(&list, &specs[..70]).unwrap();
+    let long_ago = std::time::SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
+    let file = std::fs::File::options().write(true).open(&list).unwrap();
+    file.set_modified(long_ago).unwrap();
+    drop(following);
+    let _what_it_had_made = std::fs::remove_dir_all(&archive);
+    assert_failed(&run(ingest), 1, &["list.json"]);
+}
+
 /// It may be about others of such names, or be saved too early.
 #[test]
 fn a_project_of_some_of_the_tiles_is_told() {
