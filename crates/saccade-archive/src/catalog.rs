@@ -56,13 +56,14 @@ use crate::clock::{Clock, SystemClock};
 use database::{Database, Durability, Row, Statement, Transaction, Value};
 
 pub use commit::{Commit, DeleteOutcome, TileOutcome, TransformOutcome};
+pub(crate) use entries::differences;
 pub use entries::{
     CatalogChange, ChangeReason, NewTile, Quarantined, Retired, Statistics, Tile, TileId,
     VolumeEntry, Waiting, place,
 };
 pub use error::CatalogError;
 pub use location::CatalogLocation;
-pub use origins::{Naming, Origin};
+pub use origins::{Naming, Origin, Placing};
 pub use spoilt::{Listed, SpoiltTile};
 pub use workers::{Claim, HeldUp, Worker};
 
@@ -220,28 +221,15 @@ impl Catalog {
             }
             there => there?,
         };
-        let differs = |what, existing: String, asked: String| {
-            let same = existing == asked;
-            let name = volume.name.clone();
-            (!same).then_some(CatalogError::WrongVolume {
-                name,
+        match differences(&there, volume).into_iter().next() {
+            None => Ok(()),
+            Some((what, existing, asked)) => Err(CatalogError::WrongVolume {
+                name: volume.name.clone(),
                 what,
                 existing,
                 asked,
-            })
-        };
-        let of = |v: &Volume| {
-            [
-                ("extent", format!("{} voxels", v.extent())),
-                ("voxel size", format!("{} nm", v.voxel_nm)),
-                ("voxel type", format!("{:?}", v.dtype).to_lowercase()),
-                ("kind", format!("{:?}", v.kind).to_lowercase()),
-                ("channels", v.channels.join(", ")),
-            ]
-        };
-        let pairs = of(&there).into_iter().zip(of(volume));
-        let wrong = pairs.map(|((what, existing), (_, asked))| differs(what, existing, asked));
-        wrong.flatten().next().map_or(Ok(()), Err)
+            }),
+        }
     }
 
     async fn insert_volume(&self, volume: &Volume) -> Result<(), CatalogError> {

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures::{StreamExt as _, stream};
+use saccade_core::volume::Dtype;
 
 use crate::VisualizationArchive;
 use crate::acquisition::Cursor;
@@ -19,8 +20,10 @@ use crate::randomness::Keyed;
 use crate::storage::StorageError;
 
 mod cursor;
+mod described;
 mod half_deleted;
 mod misplaced;
+mod moved;
 mod orphans;
 mod records;
 mod repair;
@@ -98,8 +101,10 @@ pub enum CheckError {
 /// [`CheckOptions::repair`] its indexes are made anew, and where it is sound then, the rest follows.
 ///
 /// Where the records are at hand, the catalog is held against them: a tile that it lacks, or of which it says something else
-/// than the record, is found, and given back to ingest if that is wanted. A row that is called deleted and is not as a
-/// deletion leaves it is brought back.
+/// than the record, is found, and given back to ingest if that is wanted; one that lies elsewhere than its newest record says is moved
+/// there, unless somebody may have moved it since. So are what the catalog says of the volume, and of how far its records were read.
+/// A tile that the catalog lost is taken in again, be it that somebody other than the microscope had deleted it: nothing tells.
+/// A row that is called deleted and is not as a deletion leaves it is brought back.
 ///
 /// # Errors
 ///
@@ -143,6 +148,9 @@ pub async fn check(
         lacking: HashSet::new(),
         doubtful: HashSet::new(),
         unread: HashSet::new(),
+        elsewhere: Vec::new(),
+        of_other_types: Vec::new(),
+        of_its_type: 0,
     };
     for volume in volumes {
         match volume.entry {
@@ -195,6 +203,12 @@ struct Check<'a> {
     doubtful: HashSet<String>,
     /// Volumes of which it is not known how far their records were read.
     unread: HashSet<String>,
+    /// Tiles of the section at hand that lie where their newest record does not say.
+    elsewhere: Vec<(Tile, records::Said)>,
+    /// Tiles of the volume at hand whose voxels are of another type than the volume's.
+    of_other_types: Vec<(Tile, Dtype)>,
+    /// How many tiles of the volume at hand are of its type.
+    of_its_type: u64,
 }
 
 impl Check<'_> {
@@ -203,7 +217,8 @@ impl Check<'_> {
         let volume = &entry.volume;
         let before = self.report.tiles;
         self.read_up_to(entry).await?;
-        self.read_records(entry).await?;
+        self.read_records(entry).await;
+        self.described(entry);
         // Not those that are counted: what the counts leave out would be called nobody's.
         let sections = catalog.sections_of_tiles(&volume.name).await?;
         for &z in &sections {
@@ -224,6 +239,7 @@ impl Check<'_> {
                     Err(spoilt) => self.spoilt(entry, spoilt).await?,
                 }
             }
+            self.moved(entry, z).await?;
             (self.progress)(self.report.tiles, self.total);
         }
         for spoilt in catalog.rows_without_section(&volume.name).await? {
@@ -231,6 +247,7 @@ impl Check<'_> {
             self.spoilt(entry, spoilt).await?;
         }
         self.half_deleted(entry).await?;
+        self.of_other_types(entry).await?;
         self.lost(entry).await?;
         self.spoilt_waiting(entry).await?;
         let tiles = self.report.tiles - before;
@@ -347,6 +364,8 @@ impl Check<'_> {
         let extent = entry.volume.extent();
         if place(extent, tile.section, tile.size, tile.transform).is_none() {
             self.misplaced(entry, tile).await?;
+        } else {
+            self.compare_place(tile);
         }
         if !self.named.insert(self.hasher.hash_one(&tile.pyramid)) {
             // It was looked at with the first of them.
@@ -362,6 +381,7 @@ impl Check<'_> {
                     return self.mend(FindingKind::Mistaken, entry, tile, reason).await;
                 }
                 if [level.width, level.height] == tile.size.to_array() {
+                    self.compare_type(entry, tile, verified.index.dtype());
                     return Ok(());
                 }
                 let catalog = self.archive.catalog();

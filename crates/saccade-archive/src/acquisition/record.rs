@@ -142,6 +142,17 @@ impl Record {
     /// The longest line that is a record \[bytes\].
     pub const LONGEST: usize = prefix::MAX_LINE;
 
+    /// Most voxels that a pixel may span along an axis, and most pixels that a voxel may.
+    pub const LARGEST_PIXEL: f64 = 512.0;
+
+    /// Whether a transform can be meant: a tile's pixels are about as large as an overview's, or a fine region's, could be. Others
+    /// are not followed.
+    pub fn is_sensible(transform: SectionFromTile) -> bool {
+        let sensible = 1.0 / Self::LARGEST_PIXEL..=Self::LARGEST_PIXEL;
+        let [a, b, c, d, ..] = transform.elements();
+        sensible.contains(&a.hypot(b)) && sensible.contains(&c.hypot(d))
+    }
+
     /// A line without its end, or what is wrong with it.
     ///
     /// # Errors

@@ -147,6 +147,22 @@ pub struct Statistics {
     pub early: u64,
 }
 
+/// In what two volumes differ of what tells one from another: what it is, and what each has.
+pub(crate) fn differences(one: &Volume, other: &Volume) -> Vec<(&'static str, String, String)> {
+    let of = |v: &Volume| {
+        [
+            ("extent", format!("{} voxels", v.extent())),
+            ("voxel size", format!("{} nm", v.voxel_nm)),
+            ("voxel type", format!("{:?}", v.dtype).to_lowercase()),
+            ("kind", format!("{:?}", v.kind).to_lowercase()),
+            ("channels", v.channels.join(", ")),
+        ]
+    };
+    let pairs = of(one).into_iter().zip(of(other));
+    let pairs = pairs.map(|((what, one), (_, other))| (what, one, other));
+    pairs.filter(|(_, one, other)| one != other).collect()
+}
+
 /// Where a tile lies in a volume of `extent` \[level-0 voxels\], cut at the volume's faces; `None`
 /// if it is wholly outside.
 pub fn place(

@@ -1,7 +1,9 @@
 //! Which tiles name a pyramid, and which records say what these are.
 
+use saccade_core::voxel_box::VoxelBox;
+
 use super::database::Row;
-use super::{Catalog, CatalogError, rows};
+use super::{Catalog, CatalogError, TileId, rows};
 
 /// Which records say what a tile is.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -12,6 +14,19 @@ pub struct Origin {
     pub position: u64,
     /// Position of the record that brought its transform.
     pub transform_position: u64,
+}
+
+/// What brought a tile to where it lies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Placing {
+    /// The tile.
+    pub tile: TileId,
+    /// Position of the record that brought its transform, or on which somebody moved it.
+    pub transform_position: u64,
+    /// The volume's revision when the tile last changed.
+    pub revision: u64,
+    /// Which voxels changed then \[level-0 voxels\]; `None` if that is no longer kept.
+    pub change: Option<VoxelBox>,
 }
 
 /// A row of the table of tiles, of whichever volume, be the tile there or deleted.
@@ -53,6 +68,41 @@ impl Catalog {
                         WHERE volume = $1 AND pyramid = $2 AND deleted = 0 ORDER BY id";
         let values = [id.into(), pyramid.into()];
         self.ask(question, &values, rows::origin).await
+    }
+
+    /// What brought the tiles of a section to where they lie; those of which it cannot be understood are left out.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn placings(&self, volume: &str, z: u32) -> Result<Vec<Placing>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT t.id AS placed, t.transform_position AS transform_position, t.revision AS placed_at, \
+                        coalesce(c.revision, -1) AS revision, coalesce(c.tile, -1) AS tile, \
+                        coalesce(c.section, 0) AS section, coalesce(c.x0, 0) AS x0, coalesce(c.y0, 0) AS y0, \
+                        coalesce(c.x1, 0) AS x1, coalesce(c.y1, 0) AS y1, coalesce(c.reason, 'tile') AS reason \
+                        FROM tiles AS t LEFT JOIN changes AS c \
+                        ON c.volume = t.volume AND c.revision = t.revision AND c.tile = t.id \
+                        WHERE t.volume = $1 AND t.section = $2 AND t.deleted = 0";
+        let placing = |row: &Row| {
+            let change = match row.get::<i64>("revision")? {
+                -1 => None,
+                _ => rows::change(row).ok(),
+            };
+            let known = rows::unsigned(row, "transform_position")
+                .and_then(|position| Ok((position, rows::unsigned(row, "placed_at")?)));
+            let Ok((transform_position, revision)) = known else {
+                return Ok(None);
+            };
+            Ok(Some(Placing {
+                tile: TileId(row.get("placed")?),
+                transform_position,
+                revision,
+                change: change.map(|change| change.voxels),
+            }))
+        };
+        let placings = self.ask(question, &[id.into(), z.into()], placing).await?;
+        Ok(placings.into_iter().flatten().collect())
     }
 
     /// The tiles that were entered last, as far as their records tell, at most `most`: names, and positions of records. Looks at

@@ -36,6 +36,19 @@ impl Catalog {
         self.ask(question, &values, rows::quarantined).await
     }
 
+    /// Whether anything of a tile is in quarantine.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn is_set_aside(&self, volume: &str, tile: &str) -> Result<bool, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id FROM quarantine WHERE volume = $1 AND tile = $2 LIMIT 1";
+        let values = [id.into(), tile.into()];
+        let found = self.ask(question, &values, |row| row.get::<i64>("id"));
+        Ok(!found.await?.is_empty())
+    }
+
     /// How far the records were read.
     ///
     /// # Errors

@@ -5,21 +5,34 @@ use std::hash::BuildHasher as _;
 use std::path::Path;
 
 use glam::UVec2;
+use saccade_core::transform::SectionFromTile;
+use saccade_core::volume::Volume;
 
-use super::repair::position_of;
+use super::repair::{Source, position_of};
 use super::{Check, CheckError, Finding, FindingKind, Repair};
-use crate::acquisition::{AcquisitionInfo, Cursor, Record, RecordReader};
-use crate::catalog::{Tile, VolumeEntry};
+use crate::acquisition::{Cursor, DeleteRecord, Record, RecordReader, TileRecord, TransformRecord};
+use crate::catalog::{Tile, VolumeEntry, place};
 use crate::randomness::Keyed;
 
 /// Records that are read at once.
 pub(super) const AT_ONCE: usize = 4096;
 
-/// What the records that were read say of each tile, by hashes of names: some 60 bytes of memory per tile.
+/// What the records that were read say of each tile, by hashes of names: some 120 bytes of memory per tile.
 #[derive(Debug)]
 pub(super) struct Records {
     newest: HashMap<u64, Newest>,
     hasher: Keyed,
+}
+
+/// What says where a tile lies.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Said {
+    /// Position of the record.
+    pub(super) record: u64,
+    /// From which position on the catalog follows it: one that came before its tile counts from there.
+    pub(super) position: u64,
+    /// Hash of the transform.
+    hash: u64,
 }
 
 /// The newest record of a tile's image, or of its end.
@@ -28,6 +41,8 @@ struct Newest {
     position: u64,
     /// `None`: it was deleted.
     image: Option<Image>,
+    /// Where the tile lies, if it is inside of the volume there.
+    said: Option<Said>,
     /// Whether the catalog has the tile.
     met: bool,
 }
@@ -42,13 +57,15 @@ struct Image {
 }
 
 impl Records {
-    /// Those up to `read`, if they are what was read.
-    fn read(folder: &Path, read: Cursor, channels: &[String], hasher: Keyed) -> Option<Self> {
+    /// Those of a volume up to `read`, if they are what was read.
+    fn read(folder: &Path, read: Cursor, volume: &Volume, hasher: Keyed) -> Option<Self> {
         RecordReader::new(folder, read).recognize().ok()?;
         let mut records = Self {
             newest: HashMap::new(),
             hasher,
         };
+        // Transforms whose tile comes later.
+        let mut early = HashMap::new();
         let mut reader = RecordReader::new(folder, Cursor::default());
         while reader.cursor().offset < read.offset {
             let lines = reader.read(AT_ONCE).ok()?;
@@ -56,29 +73,86 @@ impl Records {
                 break;
             }
             for line in lines.into_iter().filter(|line| line.offset < read.offset) {
-                let (tile, image) = match line.record {
-                    Ok(Record::Tile(record)) => {
-                        let image = Image {
-                            section: record.section,
-                            size: record.size,
-                            channel: record.channel_among(channels),
-                        };
-                        (record.tile, Some(image))
-                    }
-                    Ok(Record::Delete(record)) => (record.tile, None),
-                    Ok(Record::Transform(_)) | Err(_) => continue,
-                };
-                let newest = Newest {
-                    position: line.offset,
-                    image,
-                    met: false,
-                };
-                records
-                    .newest
-                    .insert(records.hasher.hash_one(&tile), newest);
+                if let Ok(record) = line.record {
+                    records.note(line.offset, &record, volume, &mut early);
+                }
             }
         }
         Some(records)
+    }
+
+    /// Notes what the record at a position says, after those before it.
+    fn note(
+        &mut self,
+        position: u64,
+        record: &Record,
+        volume: &Volume,
+        early: &mut HashMap<u64, (u64, SectionFromTile)>,
+    ) {
+        let extent = volume.extent();
+        let name = match record {
+            Record::Tile(TileRecord { tile, .. })
+            | Record::Transform(TransformRecord { tile, .. })
+            | Record::Delete(DeleteRecord { tile }) => self.hasher.hash_one(tile),
+        };
+        let known = self.newest.get_mut(&name);
+        let inside = |image: Image, at| place(extent, image.section, image.size, at).is_some();
+        let (image, said) = match record {
+            Record::Tile(record) => {
+                let image = Image {
+                    section: record.section,
+                    size: record.size,
+                    channel: record.channel_among(&volume.channels),
+                };
+                let is_new = known.is_none_or(|known| known.image.is_none());
+                let before = early.remove(&name).filter(|_| is_new);
+                let own = (position, record.transform);
+                let said = before.into_iter().chain([own]);
+                let said = { said }.find(|(_, at)| inside(image, *at));
+                (Some(image), said)
+            }
+            // Ingest has set it aside.
+            Record::Transform(record) if !Record::is_sensible(record.transform) => return,
+            Record::Transform(record) => {
+                let at = (position, record.transform);
+                match known.and_then(|known| Some((known.image?, &mut known.said))) {
+                    Some((image, said)) if inside(image, at.1) => {
+                        *said = Some(Said {
+                            record: position,
+                            position,
+                            hash: self.hasher.hash_one(bits(at.1)),
+                        });
+                    }
+                    Some(_) => {}
+                    None => drop(early.insert(name, at)),
+                }
+                return;
+            }
+            Record::Delete(_) => {
+                early.remove(&name);
+                (None, None)
+            }
+        };
+        let said = said.map(|(record, at)| Said {
+            record,
+            position,
+            hash: self.hasher.hash_one(bits(at)),
+        });
+        let newest = Newest {
+            position,
+            image,
+            said,
+            met: false,
+        };
+        self.newest.insert(name, newest);
+    }
+
+    /// What the newest record of a tile's place says, if the catalog has the tile of its newest image and it does not lie there.
+    pub(super) fn elsewhere(&self, tile: &Tile) -> Option<Said> {
+        let newest = self.newest.get(&self.hasher.hash_one(&tile.name))?;
+        let is_newest = position_of(&tile.pyramid) == Some(newest.position);
+        let said = newest.said.filter(|_| is_newest);
+        said.filter(|said| said.hash != self.hasher.hash_one(bits(tile.transform)))
     }
 
     /// Whether the newest of a tile's records is its end.
@@ -127,30 +201,24 @@ impl Records {
     }
 }
 
+/// What of a transform tells it from others, as a catalog keeps it: one without signs of zeros.
+fn bits(transform: SectionFromTile) -> [u64; 6] {
+    transform
+        .elements()
+        .map(|element| (element + 0.0).to_bits())
+}
+
 impl Check<'_> {
-    /// What the records say, if they are at hand; and whether the volume is as they say.
-    pub(super) async fn read_records(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
+    /// What the records say, if they are at hand.
+    pub(super) async fn read_records(&mut self, entry: &VolumeEntry) {
         self.records = None;
         let Some((folder, read)) = self.folder_of(entry).zip(self.read) else {
-            return Ok(());
+            return;
         };
-        let (channels, of) = (entry.volume.channels.clone(), folder.clone());
+        let volume = entry.volume.clone();
         let hasher = Keyed::new(self.archive.randomness());
-        let work = move || Records::read(&of, read, &channels, hasher);
+        let work = move || Records::read(&folder, read, &volume, hasher);
         self.records = tokio::task::spawn_blocking(work).await.unwrap_or_default();
-        let info = AcquisitionInfo::read(&folder).ok();
-        let Some(volume) = info.and_then(|info| info.volume().ok()) else {
-            return Ok(());
-        };
-        let (has, said) = (entry.volume.extent(), volume.extent());
-        if self.records.is_some() && has != said {
-            let reason = format!(
-                "the catalog says that the volume has {has} voxels, its acquisition {said}: put a copy of the catalog in its \
-                 place, from which `saccade ingest` goes on"
-            );
-            self.find(FindingKind::Spoilt, entry, None, reason);
-        }
-        Ok(())
     }
 
     /// What the catalog says of a tile that cannot be so, or not if its record is right.
@@ -180,10 +248,10 @@ impl Check<'_> {
         let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
         let lost =
             { records.newest.values() }.filter(|newest| !newest.met && newest.image.is_some());
-        let mut lost: Vec<u64> = lost.map(|newest| newest.position).collect();
+        let mut lost: Vec<_> = lost.map(|newest| (newest.position, newest.said)).collect();
         drop(records);
-        lost.sort_unstable();
-        for position in lost {
+        lost.sort_unstable_by_key(|(position, _)| *position);
+        for (position, said) in lost {
             let Some((_, Record::Tile(record))) = self.record_at(entry, position) else {
                 continue;
             };
@@ -191,16 +259,19 @@ impl Check<'_> {
                 continue;
             }
             self.kept.insert((volume.clone(), position));
-            let mut reason = "its record was read, and the catalog knows nothing of it".to_owned();
+            let mut reason = "its record was read, and the catalog knows nothing of it, nor whether `saccade update` has \
+                              deleted it since"
+                .to_owned();
             let (tile, mut repair) = (record.tile, None);
-            match self.tile_record(entry, Some(&tile), position) {
-                Some(record) if self.options.repair => {
-                    let why = format!("the catalog had lost it: {reason}");
-                    self.queue(entry, position, record, why).await?;
+            match self.source(entry, Some(&tile), Some(position)) {
+                Source::There(position, record) if self.options.repair => {
+                    let why = "the catalog had lost it: its record was read, and nothing was known of it";
+                    self.queue(entry, position, record, why.to_owned()).await?;
+                    self.keep_place(entry, &tile, said.filter(|said| said.record > position)).await?;
                     repair = Some(Repair::Queued);
                 }
-                Some(_) => {}
-                None => reason.push_str(
+                Source::There(..) => {}
+                _ => reason.push_str(
                     ", and its image is not there any more: put it back, or append a record that it is deleted",
                 ),
             }
@@ -212,6 +283,26 @@ impl Check<'_> {
                 reason,
                 repair,
             });
+        }
+        Ok(())
+    }
+
+    /// Where a tile that is made anew is to lie, if a record said so after its own: nobody reads that one again.
+    async fn keep_place(
+        &self,
+        entry: &VolumeEntry,
+        tile: &str,
+        said: Option<Said>,
+    ) -> Result<(), CheckError> {
+        let record = said.and_then(|said| self.record_at(entry, said.record));
+        if let Some((said, (_, Record::Transform(record)))) = said.zip(record)
+            && record.tile == tile
+        {
+            let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+            commit
+                .transform(tile, record.transform, Some(said.record))
+                .await?;
+            commit.finish().await?;
         }
         Ok(())
     }

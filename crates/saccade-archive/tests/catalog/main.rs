@@ -60,6 +60,7 @@ on_both! {
     spoilt::chunks_that_no_memory_holds_make_no_volume,
     spoilt::what_is_queued_and_cannot_be_understood_is_set_aside,
     spoilt::what_a_tile_names_is_not_on_the_list_of_what_is_to_be_deleted,
+    spoilt::what_no_program_of_ours_does_to_a_tile_is_found,
     whose::another_archives_catalog_is_neither_read_nor_written,
     whose::a_table_that_is_gone_is_named_with_the_way_out,
     workers::workers_share_what_is_to_be_done,

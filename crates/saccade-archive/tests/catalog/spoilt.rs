@@ -196,3 +196,57 @@ pub(crate) async fn what_a_tile_names_is_not_on_the_list_of_what_is_to_be_delete
     let retired: Vec<_> = retired.into_iter().map(|r| r.pyramid).collect();
     assert_eq!(retired, ["elsewhere.tif"]);
 }
+
+/// Whoever deletes by hand, and whoever moves by hand.
+pub(crate) async fn what_no_program_of_ours_does_to_a_tile_is_found(place: &Place) {
+    let catalog = place.catalog().await;
+    for (n, name) in (0..).zip(["a", "b", "c"]) {
+        let new = tile(name, 0, at(3.0, 2.0), n);
+        catalog.commit_tile("v", &new).await.unwrap();
+    }
+    catalog.refuse_impossible("v").await.unwrap();
+    catalog.delete_tile("v", "a", 7).await.unwrap();
+    assert_eq!(catalog.half_deleted("v").await.unwrap(), []);
+    catalog.refuse_impossible("v").await.unwrap();
+    place
+        .meddle("UPDATE tiles SET deleted = 1 WHERE name = 'b'")
+        .await;
+    let refused = catalog.refuse_impossible("v").await.unwrap_err();
+    assert!(
+        matches!(&refused, CatalogError::SpoiltTile { tile, .. } if tile == "b"),
+        "{refused}"
+    );
+    let found = catalog.half_deleted("v").await.unwrap();
+    let [Ok(b)] = &found[..] else {
+        panic!("{found:?}");
+    };
+    let mut commit = catalog.begin("v").await.unwrap();
+    commit.undelete(b).await.unwrap();
+    let revision = commit.finish().await.unwrap();
+    assert_eq!(catalog.half_deleted("v").await.unwrap(), []);
+    assert_eq!(catalog.entry("v").await.unwrap().tiles, 2);
+    assert_eq!(
+        catalog.tile("v", "b").await.unwrap().unwrap().revision,
+        revision
+    );
+
+    catalog.set_transform("v", "c", at(9.0, 8.0)).await.unwrap();
+    let placings = catalog.placings("v", 0).await.unwrap();
+    let c = catalog.tile("v", "c").await.unwrap().unwrap();
+    let [of_b, of_c] = [b.id, c.id].map(|id| {
+        let mut of = placings.iter().filter(|placing| placing.tile == id);
+        of.next().unwrap()
+    });
+    assert_eq!((of_b.transform_position, of_c.transform_position), (1, 2));
+    assert_eq!((of_b.revision, of_c.revision), (revision, c.revision));
+    let lies = |at| lies(EXTENT, 0, c.size, at).unwrap();
+    assert_eq!(of_b.change, Some(lies(at(3.0, 2.0))));
+    let both = lies(at(3.0, 2.0)).union(lies(at(9.0, 8.0)));
+    assert_eq!(of_c.change, Some(both));
+    let newest = catalog.newest_records("v", 1).await.unwrap();
+    assert_eq!(newest, [("c".to_owned(), 2)]);
+    assert!(!catalog.is_set_aside("v", "c").await.unwrap());
+    place.meddle("DELETE FROM changes").await;
+    let placings = catalog.placings("v", 0).await.unwrap();
+    assert!(placings.iter().all(|placing| placing.change.is_none()));
+}

@@ -30,8 +30,8 @@ pub(crate) struct Check {
     #[arg(long)]
     quick: bool,
 
-    /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume to where their records
-    /// say; bring back tiles that are called deleted and are not as a deletion leaves
+    /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume, or where nothing says
+    /// that they do, to where their records say; bring back tiles that are called deleted and are not as a deletion leaves
     /// them; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back to
     /// `saccade ingest`, or set them aside if --acquisition does not help [default: change nothing]
     #[arg(long)]
@@ -98,6 +98,14 @@ impl Check {
             for finding in &report.findings {
                 tell(&line(finding));
             }
+        }
+        let again = |f: &&Finding| f.kind == FindingKind::Lost && f.repair == Some(Repair::Queued);
+        let again = report.findings.iter().filter(again).count();
+        if again > 0 {
+            say(&format!(
+                "{again} tiles that the catalog had lost are taken in again; of those that `saccade update` had deleted, nothing \
+                 tells any more: delete these once more"
+            ));
         }
         say(&format!("{}: {location}", summary(&report)));
         Ok(if report.damage() > 0 || made > 0 {

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::errors::text;
 use super::update::ended;
@@ -17,9 +17,10 @@ fn run(arguments: &[&str]) -> Output {
         .stdout(Stdio::piped())
         .stderr(Stdio::piped());
     let mut child = command.spawn().unwrap();
-    let begun = Instant::now();
+    let mut looks = 0;
     while child.try_wait().unwrap().is_none() {
-        if begun.elapsed() > Duration::from_secs(45) {
+        looks += 1;
+        if looks > 2000 {
             child.kill().unwrap();
             panic!("{arguments:?} does not end");
         }
@@ -57,7 +58,7 @@ fn a_pipe_in_the_place_of_a_pyramid_is_damage_and_mended() {
         let told = String::from_utf8(checked.stdout).unwrap();
         assert!(
             told.contains("a named pipe")
-                && told.contains(text(&pyramid.strip_prefix(&archive).unwrap())),
+                && told.contains(text(pyramid.strip_prefix(&archive).unwrap())),
             "{told}"
         );
     }
