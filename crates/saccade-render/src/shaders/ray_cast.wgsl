@@ -153,15 +153,19 @@ fn segments_until(until: f32, depth: f32, step: f32) -> u32 {
 // What is drawn of each channel, found for a sample of some level; holds for more of them.
 var<private> drawn: array<Source, SLOTS>;
 var<private> drawn_for: array<u32, SLOTS>;
-// A bit per channel: nothing is known of the brick; nothing of it is seen.
+// A bit per channel: nothing is known of the brick; nothing of it is seen; another level than wanted stands in, where several
+// channels are seen.
 var<private> missing: u32;
 var<private> transparent: u32;
+var<private> elsewhere: u32;
 // Of the brick that is drawn, as the sampler counts: the first sample, the way to the next per depth, the
 // lowest corner and what a voxel is.
 var<private> first_texel: array<vec3f, SLOTS>;
 var<private> texels_per_depth: array<vec3f, SLOTS>;
 var<private> low_texel: array<vec3f, SLOTS>;
 var<private> texel: vec3f;
+// Where all channels that are sampled are drawn from one level, the way to the next sample per depth of all of them.
+var<private> texels_of_all: vec3f;
 // The same of the bricks after it, where one channel is seen, and with which samples of the row they begin.
 var<private> next_texel: array<vec3f, 2>;
 var<private> next_low: array<vec3f, 2>;
@@ -192,6 +196,12 @@ fn draw_from(channel: u32, here: Source) {
         let slot = here.found.entry - FIRST_SLOT;
         mark_brick_used(slot);
         unseen = is_transparent(channel, slot);
+    }
+    if SLOTS > 1u {
+        let distance = i32(here.level) - i32(drawn_for[channel]);
+        let stands_in = here.found.entry >= FIRST_SLOT && distance != 0;
+        elsewhere = select(elsewhere & ~bit, elsewhere | bit, stands_in);
+        substituted_levels = max(substituted_levels, select(0u, u32(abs(distance)), stands_in));
     }
     missing = select(missing & ~bit, missing | bit, here.found.entry < EMPTY);
     transparent = select(transparent & ~bit, transparent | bit, unseen);
@@ -280,7 +290,8 @@ fn aim(channel: u32, depth: f32) {
     let corner = corner_of(channel);
     low_texel[channel] = corner * texel;
     first_texel[channel] = (corner + here.eye + depth * here.voxels) * texel;
-    texels_per_depth[channel] = here.voxels * texel;
+    texels_of_all = here.voxels * texel;
+    texels_per_depth[channel] = texels_of_all;
 }
 
 // Where samples lie in one brick of a row, the first of the row at `depth`, and with which sample it begins.
@@ -343,8 +354,9 @@ fn joined(texel: vec3i) -> f32 {
     return dot(textureLoad(bricks, texel, 0).rg, frame.combine);
 }
 
-// A place in a channel's brick: of a sample, by its number in the row of bricks, so far ahead of the first.
-fn in_brick(channel: u32, number: f32, ahead: f32) -> vec3f {
+// A place in a channel's brick: of a sample, by its number in the row of bricks, so far ahead of the first. `alike` where all channels are
+// drawn from one level: what is addressed by number is slow to read.
+fn in_brick(channel: u32, number: f32, ahead: f32, alike: bool) -> vec3f {
     var first = first_texel[channel];
     var low = low_texel[channel];
     if SLOTS == 1u {
@@ -355,16 +367,21 @@ fn in_brick(channel: u32, number: f32, ahead: f32) -> vec3f {
             low = select(low, next_low[1], number >= turns.y);
         }
     }
-    let at = first + ahead * texels_per_depth[channel];
+    var way = texels_per_depth[channel];
+    if SLOTS > 1u && alike {
+        way = texels_of_all;
+    }
+    let at = first + ahead * way;
     if BOUNDED {
         return clamp(at, low, low + f32(BRICK_EDGE) * texel);
     }
     return at;
 }
 
-// Takes a sample of a channel, by its number in the row of bricks, so far ahead of the first. Linear RGB and extinction of it, or what the mode keeps of it.
-fn sampled_at(channel: u32, number: f32, ahead: f32, step: f32) -> vec4f {
-    let stored = stored_at(in_brick(channel, number, ahead));
+// Takes a sample of a channel, by its number in the row of bricks, so far ahead of the first; `alike` as there. Linear RGB and extinction of it, or
+// what the mode keeps of it.
+fn sampled_at(channel: u32, number: f32, ahead: f32, step: f32, alike: bool) -> vec4f {
+    let stored = stored_at(in_brick(channel, number, ahead, alike));
     if MODE == MODE_EMISSION_ABSORPTION {
         let color = color_of(channel, stored);
         return vec4f(false_color(color.rgb, drawn[channel].level, drawn_for[channel]), color.a);
@@ -387,7 +404,7 @@ fn sampled_at(channel: u32, number: f32, ahead: f32, step: f32) -> vec4f {
                 surface = channel;
                 surface_level = drawn[channel].level;
                 surface_wanted = drawn_for[channel];
-                surface_at = in_brick(channel, number, at);
+                surface_at = in_brick(channel, number, at, alike);
             }
         }
     }
@@ -655,34 +672,41 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                     count = min(count, max(u32((depths.y - start) / step), 1u));
                     let halvings = -LOG2_E * first * nm_per_depth;
                     nothing_before(everything & ~sampled);
-                    var rest = visible;
-                    for (var n = count_of(visible); n > 0u; n -= 1u) {
-                        let c = lowest_of(rest);
-                        rest &= rest - 1u;
-                        if drawn[c].found.entry >= FIRST_SLOT {
-                            let distance = i32(drawn[c].level) - i32(drawn_for[c]);
+                    var alike = true;
+                    var level_of_all = MAX_LEVELS;
+                    if SLOTS == 1u {
+                        if drawn[0].found.entry >= FIRST_SLOT {
+                            let distance = i32(drawn[0].level) - i32(drawn_for[0]);
                             if distance != 0 {
                                 substituted_levels = max(substituted_levels, u32(abs(distance)));
                                 substituted += count;
                             }
                         }
-                        if SLOTS > 1u && (sampled & (1u << c)) != 0u {
+                    } else {
+                        substituted += count * countOneBits(elsewhere & visible);
+                        var rest = sampled;
+                        for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
+                            let c = firstTrailingBit(rest);
+                            rest &= rest - 1u;
                             aim(c, depth);
+                            alike = alike && (level_of_all == MAX_LEVELS || level_of_all == drawn[c].level);
+                            level_of_all = drawn[c].level;
                         }
                     }
                     let end = f32(count);
                     var i = 0.0;
-                    if sampled != 0u {
+                    // Channels of several levels, which are few, are sampled below.
+                    if sampled != 0u && (SLOTS == 1u || alike) {
                         loop {
                             let ahead = i * step;
                             var sum = vec4f(0.0);
                             hit_at = 3e38;
                             if SLOTS == 1u {
-                                sum = sampled_at(0u, i, ahead, step);
+                                sum = sampled_at(0u, i, ahead, step, true);
                             } else {
                                 var rest = sampled;
                                 for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
-                                    let color = sampled_at(firstTrailingBit(rest), i, ahead, step);
+                                    let color = sampled_at(firstTrailingBit(rest), i, ahead, step, true);
                                     rest &= rest - 1u;
                                     sum += vec4f(color.a * color.rgb, color.a);
                                 }
@@ -691,6 +715,33 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                                 let through = transmitted * exp2(sum.a * halvings);
                                 let share = select(1.0 / max(sum.a, 1e-30), 1.0, SLOTS == 1u);
                                 light += (transmitted - through) * share * sum.rgb;
+                                transmitted = through;
+                            }
+                            if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
+                                surface_is_cut = segments == 0u && i == 0.0;
+                                surface_light = transmitted;
+                                transmitted = 0.0;
+                            }
+                            i += 1.0;
+                            continuing {
+                                break if i >= end || transmitted <= TERMINATION;
+                            }
+                        }
+                    }
+                    if SLOTS > 1u && sampled != 0u && !alike {
+                        loop {
+                            let ahead = i * step;
+                            var sum = vec4f(0.0);
+                            hit_at = 3e38;
+                            var rest = sampled;
+                            for (var n = countOneBits(sampled); n > 0u; n -= 1u) {
+                                let color = sampled_at(firstTrailingBit(rest), i, ahead, step, false);
+                                rest &= rest - 1u;
+                                sum += vec4f(color.a * color.rgb, color.a);
+                            }
+                            if MODE == MODE_EMISSION_ABSORPTION {
+                                let through = transmitted * exp2(sum.a * halvings);
+                                light += (transmitted - through) / max(sum.a, 1e-30) * sum.rgb;
                                 transmitted = through;
                             }
                             if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {

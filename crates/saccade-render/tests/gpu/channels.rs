@@ -5,10 +5,11 @@ use std::collections::HashSet;
 use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
 use saccade_core::space::Point;
-use saccade_core::transfer::ColorMap;
+use saccade_core::transfer::{ColorMap, linear_from_srgb};
 use saccade_core::volume::Polarity;
 use saccade_render::{
-    ChannelError, ChannelView, Fidelity, Gpu, Image, Renderer, RendererOptions, Traversal, View,
+    ChannelError, ChannelView, Fidelity, Gpu, Image, Mode, Renderer, RendererOptions, Traversal,
+    View,
 };
 
 use crate::harness::{caught_up, frame, gpu, keep, psnr, read, settle};
@@ -354,4 +355,36 @@ fn a_channel_keeps_to_its_levels() {
     );
     let Fidelity { level, .. } = reports.last().unwrap().fidelity;
     assert_eq!(level, Some(0));
+}
+
+/// The light of two maxima is that of each alone, also where their channels are drawn from several levels.
+#[test]
+fn channels_of_several_levels_lie_where_each_alone_does() {
+    let Some(gpu) = gpu() else { return };
+    let scene = stained();
+    let view = View {
+        mode: Mode::Maximum,
+        background: [0.0; 3],
+        ..view(Camera::around(&scene.volume).zoomed(4.0))
+    };
+    let mut views = scene.views();
+    views.truncate(2);
+    views[1].levels = 1..=1;
+    let light_of = |views: &[ChannelView]| {
+        let mut renderer = Renderer::new(&gpu, scene.volume.clone(), Default::default()).unwrap();
+        renderer.set_channels(views).unwrap();
+        settle(&mut renderer, &view, &scene);
+        let linear = |value: &u8| f64::from(linear_from_srgb(f32::from(*value) / 255.0));
+        read(&renderer).rgba.iter().map(linear).collect::<Vec<_>>()
+    };
+    let [both, first, second] = [&views[..], &views[..1], &views[1..]].map(light_of);
+    let (mut most, mut off) = (0.0_f64, 0.0);
+    for (pixel, value) in both.iter().enumerate().filter(|(at, _)| at % 4 < 3) {
+        let want = (first[pixel] + second[pixel]).min(1.0);
+        most = most.max(want);
+        off += (value - want).powi(2) / both.len() as f64;
+    }
+    assert!(most > 0.3, "hardly anything is seen: {most}");
+    let off = off.sqrt();
+    assert!(off < 0.01, "{off}");
 }
