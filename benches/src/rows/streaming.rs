@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 use glam::{DVec3, UVec2};
 use saccade_core::camera::Camera;
 use saccade_core::space::Point;
@@ -14,7 +14,7 @@ use saccade_source::memory::ArraySource;
 use saccade_stream::policy::Limits;
 use saccade_stream::{Session, SessionOptions};
 
-use super::{render, runtime};
+use super::{render, runtime, table_9_1};
 use crate::clock::Stopwatch;
 use crate::report::Row;
 use crate::scene::Random;
@@ -25,6 +25,7 @@ use crate::{cpu, memory};
 pub(crate) const STREAMING_IDS: &[&str] = &[
     "render.streaming_worst_over_median",
     "render.streaming_thread_worst_ms",
+    "render.streaming_worst_over_resident",
 ];
 pub(crate) const FLIGHT_IDS: &[&str] = &[
     "render.flight.gpu_share",
@@ -32,17 +33,35 @@ pub(crate) const FLIGHT_IDS: &[&str] = &[
     "render.flight.growth_mb",
 ];
 
+/// Degrees that the camera turns in a second.
+const DEGREES_PER_S: f64 = 30.0;
+
 /// Frames of a camera that turns.
 #[derive(Debug, Default)]
 struct Turn {
-    /// From asking for a frame until it is known to be finished \[ms\].
-    drawing: Vec<f64>,
-    /// From one finished frame to the next \[ms\].
-    apart: Vec<f64>,
+    frames: Vec<Frame>,
     /// Processor time of the drawing thread for a frame, with what arrived before it \[ms\].
     thread: Vec<f64>,
     /// Bricks handed over in the meantime.
     bricks: u64,
+}
+
+/// One that is known to be finished.
+#[derive(Clone, Copy, Debug)]
+struct Frame {
+    /// Where the camera was when it was asked for \[degrees\].
+    turned: f64,
+    /// From asking for it until it is known to be finished \[ms\].
+    drawing: f64,
+    /// Since the one before \[ms\].
+    apart: f64,
+    /// The same where a GPU draws; where processors do, what all threads had of them, which others disturb less \[ms\].
+    work: f64,
+    /// Processor time of the drawing thread in the meantime \[ms\].
+    thread: f64,
+    /// Bricks handed over in the meantime.
+    bricks: u64,
+    samples: u64,
 }
 
 impl Turn {
@@ -53,35 +72,93 @@ impl Turn {
         length: Duration,
     ) -> Result<Self> {
         let mut turn = Self::default();
+        let by_processors = table_9_1::is_cpu(session.renderer().gpu());
         let mut finished = (None, None);
+        let mut threads_before = cpu::of_threads()?;
         let mut spent = Duration::ZERO;
+        // Of the drawing thread and of bricks, since a frame was finished.
+        let (mut thread_since, mut bricks_since) = (Duration::ZERO, 0);
         let start = Stopwatch::start();
         let before = session.frame(&view_of(camera, size)).delivered;
         while start.elapsed() < length {
-            let turned = 30.0 * start.elapsed().as_secs_f64();
+            let turned = DEGREES_PER_S * start.elapsed().as_secs_f64();
             let thread = cpu::of_thread()?;
             let status = session.frame(&view_of(camera.orbited(turned, 0.0), size));
-            spent += cpu::of_thread()?.saturating_sub(thread);
+            let took = cpu::of_thread()?.saturating_sub(thread);
+            (spent, thread_since) = (spent + took, thread_since + took);
             if status.drew {
                 turn.thread.push(milliseconds(spent));
                 spent = Duration::ZERO;
             }
+            bricks_since += status.delivered - before - turn.bricks;
+            turn.bricks = status.delivered - before;
             let now = start.elapsed();
             // Two frames hardly take as long to the nanosecond.
             if let Some(time) = status
                 .frame_time
                 .filter(|_| status.frame_time != finished.0)
             {
+                let threads = cpu::of_threads()?;
+                let of_threads = threads.saturating_sub(threads_before);
+                threads_before = threads;
                 if let Some(last) = finished.1.replace(now) {
-                    turn.apart.push(milliseconds(now.saturating_sub(last)));
-                    turn.drawing.push(milliseconds(time));
+                    let apart = now.saturating_sub(last);
+                    turn.frames.push(Frame {
+                        turned: DEGREES_PER_S * now.saturating_sub(time).as_secs_f64(),
+                        drawing: milliseconds(time),
+                        apart: milliseconds(apart),
+                        work: milliseconds(if by_processors { of_threads } else { apart }),
+                        thread: milliseconds(thread_since),
+                        bricks: bricks_since,
+                        samples: status.statistics.samples,
+                    });
                 }
                 finished.0 = status.frame_time;
+                (thread_since, bricks_since) = (Duration::ZERO, 0);
             }
-            turn.bricks = status.delivered - before;
             tokio::time::sleep(Duration::from_micros(500)).await;
         }
         Ok(turn)
+    }
+
+    fn each(&self, value: impl Fn(&Frame) -> f64) -> Vec<f64> {
+        self.frames.iter().map(value).collect()
+    }
+
+    /// Median work and samples of a frame of this part of a turn.
+    fn around_there(&self, turned: f64) -> [f64; 2] {
+        const WITHIN: f64 = 5.0;
+        let near = |frame: &&Frame| (frame.turned - turned).abs() <= WITHIN;
+        let near: Vec<_> = self.frames.iter().filter(near).collect();
+        let median = |value: fn(&Frame) -> f64| {
+            let values: Vec<f64> = near.iter().map(|frame| value(frame)).collect();
+            spread(&values)[0]
+        };
+        [median(|frame| frame.work), median(|f| f.samples as f64)]
+    }
+
+    /// The frame that took longest, beside those of another turn at the same place.
+    fn longest_beside(&self, other: &Self) -> Option<(f64, String)> {
+        let beside = self.frames.iter().map(|frame| {
+            let [work, samples] = other.around_there(frame.turned);
+            (frame.work / work, frame, work, samples)
+        });
+        // Where the other turn drew nothing, there is nothing to compare with.
+        let (ratio, frame, work, samples) = beside
+            .filter(|(ratio, ..)| ratio.is_finite())
+            .max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let text = format!(
+            "{:.1} ms of work, {:.1} ms apart, at {:.0} degrees, of which the drawing thread {:.1}, {} bricks, {:.2} million samples; \
+             there with everything {work:.1} ms, {:.2} million",
+            frame.work,
+            frame.apart,
+            frame.turned,
+            frame.thread,
+            frame.bricks,
+            frame.samples as f64 / 1e6,
+            samples / 1e6
+        );
+        Some((ratio, text))
     }
 }
 
@@ -119,14 +196,13 @@ pub(crate) fn streaming(settings: &Settings) -> Result<Vec<Row>> {
     let source = Arc::new(render::source()?);
     let volume = Volume::clone(source.volume());
     let camera = Camera::around(&volume).zoomed(2.5);
-    let mut runs = [Vec::new(), Vec::new()];
-    let mut ratio = Row::new(
-        STREAMING_IDS[0],
-        "slowest over the median, of the time between frames",
-        Vec::new(),
-    );
+    let mut runs = [const { Vec::new() }; 3];
+    // What is said of each run, of the first row and of the third.
+    let mut told_of = [const { Vec::new() }; 2];
+    let mut picture = UVec2::ZERO;
     for run in 1..=RUNS {
         // So little memory that what was seen is gone when it is seen again; and so much that all stays.
+        let mut turns = Vec::new();
         for (name, gpu_bytes) in [("streaming", 12 << 20), ("all resident", 512 << 20)] {
             let (turn, size) = runtime.block_on(async {
                 let gpu = Gpu::headless().await?;
@@ -149,33 +225,52 @@ pub(crate) fn streaming(settings: &Settings) -> Result<Vec<Row>> {
                 let turn = Turn::around(&mut session, camera, size, length).await?;
                 anyhow::Ok((turn, size))
             })?;
-            ensure!(turn.apart.len() > 10, "hardly a frame was drawn");
-            let [median, _, worst] = spread(&turn.apart);
+            ensure!(turn.frames.len() > 10, "hardly a frame was drawn");
+            let apart = turn.each(|frame| frame.apart);
             let text = format!(
                 "{} frames, {} bricks arrived; ms, median / 99 % / worst: apart {}, drawing {}, drawing thread {}",
-                turn.apart.len(),
+                turn.frames.len(),
                 turn.bricks,
-                told(&turn.apart),
-                told(&turn.drawing),
+                told(&apart),
+                told(&turn.each(|frame| frame.drawing)),
                 told(&turn.thread),
             );
             eprintln!("  {name}: {text}");
-            if name == "streaming" {
-                runs[0].push(worst / median);
-                runs[1].push(spread(&turn.thread)[2]);
-            }
-            let name = format!("run {run}, {name}");
-            ratio = ratio
-                .setting("picture", format!("{}x{}", size.x, size.y))
-                .setting(&name, text);
+            told_of[0].push((format!("run {run}, {name}"), text));
+            turns.push(turn);
+            picture = size;
+        }
+        let [streaming, resident] = &turns[..] else {
+            unreachable!("a turn with little memory and one with much");
+        };
+        let [median, _, worst] = spread(&streaming.each(|frame| frame.apart));
+        runs[0].push(worst / median);
+        runs[1].push(spread(&streaming.thread)[2]);
+        let (ratio, text) = { streaming.longest_beside(resident) }.context("nothing to compare")?;
+        eprintln!("  longest, {ratio:.2} times: {text}");
+        runs[2].push(ratio);
+        told_of[1].push((format!("run {run}"), text));
+        // What the same comparison says of nothing but the machine.
+        if let Some((ratio, text)) = resident.longest_beside(resident) {
+            let name = format!("run {run}, everything there");
+            told_of[1].push((name, format!("{ratio:.2} times: {text}")));
         }
     }
-    let [ratios, threads] = runs;
-    let ratio = ratio
-        .with_runs(ratios)
+    let [ratios, threads, beside] = runs;
+    let [of_turns, of_latest] = told_of;
+    let with = |row: Row, told: Vec<(String, String)>| {
+        { told.into_iter() }.fold(row, |row, (name, text)| row.setting(&name, text))
+    };
+    let unit = "slowest over the median, of the time between frames";
+    let ratio = Row::new(STREAMING_IDS[0], unit, ratios)
+        .setting("picture", format!("{}x{}", picture.x, picture.y))
         .setting("data", "512 x 512 x 48 voxels of tissue in 12 MB of GPU memory, of the finest level, a camera that turns 30 degrees a second");
     let unit = "ms of the drawing thread for a frame and what arrived, longest";
-    Ok(vec![ratio, Row::new(STREAMING_IDS[1], unit, threads)])
+    let thread = Row::new(STREAMING_IDS[1], unit, threads);
+    let unit = "longest over frames of the same part of the turn with everything there";
+    let time = "between frames; of all threads' processors where these draw";
+    let beside = Row::new(STREAMING_IDS[2], unit, beside).setting("time", time);
+    Ok(vec![with(ratio, of_turns), thread, with(beside, of_latest)])
 }
 
 /// Frames drawn at each place of a flight.
