@@ -35,7 +35,7 @@ use glam::{DVec3, UVec3};
 use saccade_core::volume::{Dtype, Volume, VolumeError, VoxelKind};
 use serde::{Deserialize, Serialize};
 
-use crate::storage::{SystemDisk, write_whole};
+use crate::storage::{SystemDisk, read_regular, write_whole};
 
 pub use text::readable;
 
@@ -276,7 +276,7 @@ impl AcquisitionInfo {
             path: folder.to_owned(),
         })?;
         refuse_link_out(&path)?;
-        let text = match fs::read(&path) {
+        let text = match read_regular(&path) {
             Ok(text) => text,
             Err(e) if e.kind() == io::ErrorKind::NotFound => {
                 return Err(AcquisitionError::NoInfo {
@@ -422,6 +422,31 @@ mod tests {
             assert!(moved < 800.0, "{} moved by {moved}", tile.name());
         }
         assert_eq!(list[0].corner, glam::DVec2::new(0.0, 5142.0));
+    }
+
+    /// Nobody ever writes to them: whoever waited for that would wait for ever.
+    #[cfg(unix)]
+    #[test]
+    fn pipes_in_the_places_of_texts_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join(AcquisitionInfo::FILE);
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        let refused = [
+            AcquisitionInfo::read(folder.path()).map(drop),
+            tile_list::read(&pipe).map(drop),
+            tile_configuration::read(&pipe).map(drop),
+            tile_specs::read(&pipe).map(drop),
+            trakem2::read(&pipe).map(drop),
+        ];
+        for refused in refused {
+            let refused = refused.unwrap_err();
+            assert!(
+                matches!(refused, AcquisitionError::Read { .. }),
+                "{refused}"
+            );
+            assert_eq!(refused.path(), pipe);
+        }
     }
 
     #[test]

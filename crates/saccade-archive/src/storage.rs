@@ -17,7 +17,7 @@ mod memory;
 mod name;
 mod object;
 
-pub(crate) use disk::open_regular;
+pub(crate) use disk::{open_regular, read_regular};
 pub use disk::{
     Crash, DirEntry, Disk, FolderId, Metadata, OpenFile, SimulatedDisk, SystemDisk, write_whole,
 };

@@ -3,7 +3,6 @@
 //! What the microscope said is `TileConfiguration.txt`; what the plugin computed,
 //! `TileConfiguration.registered.txt`, in the same form.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::DVec2;
@@ -11,6 +10,7 @@ use glam::DVec2;
 use super::AcquisitionError;
 use super::text::{content, quoted};
 use super::tile_list::ListedTile;
+use crate::storage::read_regular;
 
 /// Reads a tile configuration. With `dim = 3`, z is the section, and a whole number; with `dim = 2`
 /// all tiles are of section 0.
@@ -20,7 +20,7 @@ use super::tile_list::ListedTile;
 /// [`AcquisitionError::Read`]; [`AcquisitionError::Utf16`]; [`AcquisitionError::Line`] for the first line that makes
 /// no sense, for a file without `dim`, and for files that hold several tiles each.
 pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
-    let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
+    let bytes = read_regular(path).map_err(|source| AcquisitionError::Read {
         source,
         path: path.to_owned(),
     })?;
@@ -119,6 +119,8 @@ fn tile(text: &str, dimensions: usize, line: u64) -> Result<ListedTile, String> 
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn parse(text: &str) -> Result<Vec<ListedTile>, AcquisitionError> {

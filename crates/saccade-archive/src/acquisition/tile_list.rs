@@ -8,6 +8,7 @@ use glam::DVec2;
 
 use super::AcquisitionError;
 use super::text::{content, quoted};
+use crate::storage::read_regular;
 
 /// A line of a tile list.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,7 +45,7 @@ pub fn stem(file: &str) -> &str {
 /// [`AcquisitionError::Read`]; [`AcquisitionError::Utf16`]; [`AcquisitionError::Line`] for the first line without
 /// three numbers at its end, or with a section that is no whole number from 0.
 pub fn read(path: &Path) -> Result<Vec<ListedTile>, AcquisitionError> {
-    let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
+    let bytes = read_regular(path).map_err(|source| AcquisitionError::Read {
         source,
         path: path.to_owned(),
     })?;

@@ -2,7 +2,6 @@
 //! its place on the stage and its list of transforms.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::Path;
 
 use glam::{DAffine2, DVec2, UVec2};
@@ -12,6 +11,7 @@ use serde::Deserialize;
 use super::AcquisitionError;
 use super::text::{content, quoted};
 use super::tile_list::stem;
+use crate::storage::read_regular;
 
 /// A tile of a Render stack.
 #[derive(Clone, Debug, PartialEq)]
@@ -119,7 +119,7 @@ struct Transform {
 /// [`AcquisitionError::Read`], [`AcquisitionError::Utf16`], [`AcquisitionError::Json`], and [`AcquisitionError::Tile`] for a tile that
 /// cannot be used.
 pub fn read(path: &Path) -> Result<Vec<TileSpec>, AcquisitionError> {
-    let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
+    let bytes = read_regular(path).map_err(|source| AcquisitionError::Read {
         source,
         path: path.to_owned(),
     })?;
@@ -274,6 +274,8 @@ fn understood(transform: &Transform) -> Result<Understood, String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use std::path::PathBuf;
 
     use saccade_core::transform::TilePoint;

@@ -2,7 +2,6 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
-use std::fs;
 use std::path::Path;
 
 use glam::UVec2;
@@ -12,6 +11,7 @@ use saccade_core::transform::SectionFromTile;
 use super::AcquisitionError;
 use super::text::{content, quoted};
 use super::tile_list::stem;
+use crate::storage::read_regular;
 
 /// A patch of a TrakEM2 project: a tile and where it lies.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,7 +45,7 @@ impl Patch {
 /// [`AcquisitionError::Read`], [`AcquisitionError::Utf16`], [`AcquisitionError::Xml`], and [`AcquisitionError::Line`] for a patch
 /// without a file, a size or an invertible transform.
 pub fn read(path: &Path) -> Result<Vec<Patch>, AcquisitionError> {
-    let bytes = fs::read(path).map_err(|source| AcquisitionError::Read {
+    let bytes = read_regular(path).map_err(|source| AcquisitionError::Read {
         source,
         path: path.to_owned(),
     })?;
@@ -178,6 +178,8 @@ fn matrix(text: &str) -> Option<[f64; 6]> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     const HEAD: &str = "\n<?xml version=\"1.0\" encoding=\"ISO-8859-1\"?>\n<!DOCTYPE trakem2_anything [\n<!ELEMENT trakem2 (project)>\n]>\n";

@@ -15,6 +15,7 @@ use sqlx::{ConnectOptions, Connection as _, SqliteConnection, SqlitePool};
 
 use super::CatalogError;
 use crate::clock::{Clock as _, SystemClock};
+use crate::storage::open_regular;
 
 mod alone;
 mod replaced;
@@ -342,8 +343,12 @@ impl FileId {
 /// A file that is not SQLite's is refused before SQLite touches it.
 fn refuse_foreign_file(path: &Path) -> Result<(), CatalogError> {
     let mut head = Vec::new();
-    let read = File::open(path).and_then(|f| f.take(16).read_to_end(&mut head));
-    let foreign = read.is_ok() && !head.is_empty() && head != b"SQLite format 3\0";
+    let read = open_regular(path).and_then(|f| f.take(16).read_to_end(&mut head));
+    let foreign = match read {
+        Ok(_) => !head.is_empty() && head != b"SQLite format 3\0",
+        // A pipe, of which nobody knows who would answer.
+        Err(error) => error.kind() == std::io::ErrorKind::NotSeekable,
+    };
     if foreign {
         Err(CatalogError::NotACatalog {
             location: path.into(),

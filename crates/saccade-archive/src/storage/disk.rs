@@ -15,7 +15,7 @@ mod regular;
 mod simulated;
 
 pub use folder_id::FolderId;
-pub(crate) use regular::open_regular;
+pub(crate) use regular::{open_regular, read_regular};
 pub use simulated::{Crash, SimulatedDisk};
 
 /// A file system, in steps that a power cut can come between. All block.

@@ -276,6 +276,31 @@ async fn the_dead_wait_for_nothing() {
     assert_eq!(catalog.held_up(VOLUME).await.unwrap(), []);
 }
 
+/// What ends an ingest whose catalog is disturbed once a tile is in.
+async fn ended_by(
+    scope: &Scope,
+    archive: &VisualizationArchive,
+    disturb: impl FnOnce(),
+) -> IngestError {
+    let options = IngestOptions {
+        once: false,
+        ..quick()
+    };
+    let (cancel, diary) = (Cancel::new(), Diary::default());
+    let ingest = run(scope.path(), archive, &options, &diary, &cancel);
+    let disturb = async {
+        while diary.states().last().is_none_or(|state| state.tiles < 1) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        disturb();
+    };
+    let both = async { tokio::join!(ingest, disturb) };
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+    let ended = both.expect("it ends").0.unwrap_err();
+    archive.catalog().close().await;
+    ended
+}
+
 /// SQLite would go on with a file that has lost its name, and all that was acknowledged would be lost with it.
 #[tokio::test]
 async fn a_catalog_that_is_taken_away_ends_it() {
@@ -283,27 +308,15 @@ async fn a_catalog_that_is_taken_away_ends_it() {
     let archive = archive(folder.path()).await;
     let [file, away] = ["catalog.sqlite", "away"].map(|name| folder.path().join(name));
     scope.tile("t0", 0, SIZE, 0);
-    let options = IngestOptions {
-        once: false,
-        ..quick()
-    };
-    let (cancel, diary) = (Cancel::new(), Diary::default());
-    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
-    let take = async {
-        while diary.states().last().is_none_or(|state| state.tiles < 1) {
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
+    let ended = ended_by(&scope, &archive, || {
         fs::rename(&file, &away).unwrap();
         scope.tile("t1", 1, SIZE, 1);
-    };
-    let both = async { tokio::join!(ingest, take) };
-    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
-    let ended = both.expect("it ends").0.unwrap_err();
+    });
+    let ended = ended.await;
     assert!(
         matches!(ended, IngestError::Catalog(CatalogError::Moved { .. })),
         "{ended}"
     );
-    archive.catalog().close().await;
     fs::rename(&away, &file).unwrap();
     let archive = crate::scope::archive(folder.path()).await;
     scope.ingest(&archive).await;
@@ -327,27 +340,15 @@ async fn an_older_copy_over_the_catalog_ends_it() {
     taken_in(1).await;
     let archive = archive(folder.path()).await;
     scope.tile("t2", 2, SIZE, 2);
-    let options = IngestOptions {
-        once: false,
-        ..quick()
-    };
-    let (cancel, diary) = (Cancel::new(), Diary::default());
-    let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
-    let replace = async {
-        while diary.states().last().is_none_or(|state| state.tiles < 1) {
-            tokio::time::sleep(Duration::from_millis(5)).await;
-        }
+    let ended = ended_by(&scope, &archive, || {
         fs::copy(&copy, &file).unwrap();
         scope.tile("t3", 3, SIZE, 3);
-    };
-    let both = async { tokio::join!(ingest, replace) };
-    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
-    let ended = both.expect("it ends").0.unwrap_err();
+    });
+    let ended = ended.await;
     assert!(
         matches!(ended, IngestError::Catalog(CatalogError::Older { .. })),
         "{ended}"
     );
-    archive.catalog().close().await;
     // As the message says.
     for beside in ["-wal", "-shm"] {
         let _what_is_there = fs::remove_file(format!("{}{beside}", file.display()));

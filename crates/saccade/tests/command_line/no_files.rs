@@ -85,4 +85,13 @@ fn a_pipe_in_the_place_of_a_pyramid_is_damage_and_mended() {
     put_a_pipe(&acquisition.join("tiles.jsonl"));
     let without = run(&[&["check", &archive][..], &records].concat());
     ended(&without, 0, &["all whole"]);
+
+    // One that nobody writes to says nothing of what is to be taken in, either.
+    put_a_pipe(&acquisition.join("volume.json"));
+    let other = folder.path().join("other");
+    let refused = run(&["ingest", text(&acquisition), text(&other)]);
+    ended(&refused, 1, &["no regular file", "volume.json"]);
+    let catalog = Path::new(&archive).join("catalog.sqlite");
+    put_a_pipe(&catalog);
+    ended(&run(&["check", &archive]), 1, &["catalog.sqlite"]);
 }

@@ -1,7 +1,7 @@
 //! Opening what is a file, and nothing else.
 
 use std::fs::{File, OpenOptions};
-use std::io;
+use std::io::{self, Read as _};
 use std::path::Path;
 
 /// Opens a file for reading. A folder is opened, too, and says what it is when it is read.
@@ -33,4 +33,16 @@ pub(crate) fn open_regular(path: &Path) -> io::Result<File> {
         true => Ok(file),
         false => Err(no_file()),
     }
+}
+
+/// What is in a file, see [`open_regular`].
+///
+/// # Errors
+///
+/// As of [`open_regular`].
+pub(crate) fn read_regular(path: &Path) -> io::Result<Vec<u8>> {
+    let mut file = open_regular(path)?;
+    let mut bytes = Vec::new();
+    file.read_to_end(&mut bytes)?;
+    Ok(bytes)
 }
