@@ -18,8 +18,8 @@
 //! [`SUB_TILE_EDGE`]² pixels. Where a level ends within a sub-tile, its last column and row are
 //! repeated. Decoded voxels lie within the sub-tile's `min..=max`, also after JPEG, so what is
 //! culled by those bounds could not have been seen. A sub-tile whose pixels are all 0 is blank: it
-//! takes no space and needs no read. Elsewhere a 0 is a measured black like any other: every pixel
-//! of a tile was acquired.
+//! takes no space, needs no read, and counts as not acquired, for it cannot be told from what surrounds an image that was turned.
+//! Elsewhere a 0 is a measured black like any other.
 //!
 //! # Checksums
 //!
