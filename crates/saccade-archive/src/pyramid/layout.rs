@@ -140,16 +140,18 @@ pub(super) struct Parts {
 
 impl Parts {
     /// The file: classic TIFF if offsets of four bytes reach everything, else `BigTIFF`.
-    pub(super) fn file(&self) -> Bytes {
+    pub(super) fn file(self) -> Bytes {
         let tiles: usize = self.coded.iter().flatten().map(|c| c.sub_tiles.len()).sum();
         // More than the description can take.
         let description = 32 * tiles as u64 + 65_536;
-        self.file_of_width(self.data_len() as u64 + description > u64::from(u32::MAX))
+        let big = self.data_len() as u64 + description > u64::from(u32::MAX);
+        self.file_of_width(big)
     }
 
-    /// The file, with offsets of eight bytes if `big`.
-    pub(super) fn file_of_width(&self, big: bool) -> Bytes {
-        let writer = Writer { parts: self, big };
+    /// The file, with offsets of eight bytes if `big`. What is in it is let go of at once, so that both together take no more
+    /// memory than one.
+    pub(super) fn file_of_width(self, big: bool) -> Bytes {
+        let writer = Writer { parts: &self, big };
         // Values are of known size: the first pass finds where the data begins, the second says so.
         let begin = writer.describe(0).len();
         let mut file = writer.describe(begin as u64);
@@ -158,10 +160,8 @@ impl Parts {
         file[sealed.index].copy_from_slice(&checksum);
         file.reserve_exact(self.data_len());
         file.extend_from_slice(&self.blank);
-        for level in self.coded.iter().rev() {
-            for part in level {
-                file.extend_from_slice(&part.bytes);
-            }
+        for part in self.coded.into_iter().rev().flatten() {
+            file.extend_from_slice(&part.bytes);
         }
         file.into()
     }
