@@ -173,7 +173,8 @@ impl RecordReader {
             }));
         }
         let prefix = Prefix::read(&mut file, offset)?;
-        if seen.is_some_and(|seen| seen != prefix.seen()) {
+        // Before the beginning there is nothing that could be another's.
+        if offset > 0 && seen.is_some_and(|seen| seen != prefix.seen()) {
             let path = path();
             return Ok(Err(AcquisitionError::RecordsReplaced { line, path }));
         }
