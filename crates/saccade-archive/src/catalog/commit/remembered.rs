@@ -30,6 +30,19 @@ impl Commit<'_> {
         pyramid: &str,
         now: SystemTime,
     ) -> Result<(), CatalogError> {
+        // One that another volume's tile may name, which nobody looks for when it is deleted.
+        let of = pyramid
+            .strip_prefix("tiles/")
+            .and_then(|rest| rest.split_once('/'));
+        if let Some((of, _)) = of
+            && of != self.name
+            && self
+                .one("SELECT id FROM volumes WHERE name = $1", &[of.into()])
+                .await?
+                .is_some()
+        {
+            return Ok(());
+        }
         let retire = "INSERT INTO retired (pyramid, volume, at) VALUES ($1, $2, $3) \
                       ON CONFLICT (pyramid) DO UPDATE SET volume = excluded.volume, at = excluded.at";
         let values = [pyramid.into(), self.volume.into(), rows::millis(now).into()];
