@@ -31,12 +31,14 @@ mod commit;
 mod database;
 mod entries;
 mod error;
+mod history;
 mod holders;
 mod identity;
 mod location;
 mod origins;
 mod postgres;
 mod remembered;
+mod revision;
 mod rows;
 mod soundness;
 mod spoilt;
@@ -62,8 +64,10 @@ pub use entries::{
     VolumeEntry, Waiting, place,
 };
 pub use error::CatalogError;
+pub use history::{History, LastChange};
 pub use location::CatalogLocation;
 pub use origins::{Naming, Origin, Placing};
+pub use revision::WrongRevision;
 pub use spoilt::{Listed, SpoiltTile};
 pub use workers::{Claim, HeldUp, Worker};
 

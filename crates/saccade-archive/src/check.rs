@@ -14,26 +14,32 @@ use saccade_core::volume::Dtype;
 
 use crate::VisualizationArchive;
 use crate::acquisition::Cursor;
-use crate::catalog::{CatalogError, Naming, Tile, VolumeEntry, place};
+use crate::catalog::{CatalogError, History, Naming, Tile, VolumeEntry, place};
 use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
-use crate::storage::StorageError;
+use crate::storage::{Entry, StorageError};
 
 mod cursor;
 mod described;
 mod half_deleted;
+mod misnamed;
 mod misplaced;
 mod moved;
+mod names;
 mod orphans;
 mod records;
 mod repair;
 mod report;
+mod revisions;
 mod shared;
 #[cfg(test)]
 mod tests;
+mod undeleted;
 mod unsound;
 
-use repair::Source;
+use names::Name;
+use repair::{Source, position_of};
+use revisions::Revisions;
 
 pub use report::{CheckReport, Finding, FindingKind, Repair, count};
 
@@ -104,7 +110,8 @@ pub enum CheckError {
 /// than the record, is found, and given back to ingest if that is wanted; one that lies elsewhere than its newest record says is moved
 /// there, unless somebody may have moved it since. So are what the catalog says of the volume, and of how far its records were read.
 /// A tile that the catalog lost is taken in again, be it that somebody other than the microscope had deleted it: nothing tells.
-/// A row that is called deleted and is not as a deletion leaves it is brought back.
+/// A row that is called deleted and that no deletion took is brought back, and one that a deletion took and is there is taken
+/// away. Where a tile does not name its own pyramid and that is there, it is named again.
 ///
 /// # Errors
 ///
@@ -122,7 +129,9 @@ pub async fn check(
         return Ok(report);
     }
     let objects = archive.storage().entries("tiles/").await?;
+    let revisions = Revisions::look(archive, options).await?;
     let volumes = archive.catalog().volumes().await?;
+    report.findings.extend(revisions.findings);
     let known = volumes
         .iter()
         .filter_map(|volume| volume.entry.as_ref().ok());
@@ -151,14 +160,24 @@ pub async fn check(
         elsewhere: Vec::new(),
         of_other_types: Vec::new(),
         of_its_type: 0,
+        objects: &objects,
+        by_record: None,
+        history: History::default(),
+        of_others: HashSet::new(),
+        renamed: HashSet::new(),
     };
+    check.find_owner(&volumes).await?;
     for volume in volumes {
         match volume.entry {
             Ok(entry) => check.volume(&entry).await?,
+            // It is told what it is about.
+            Err(_) if revisions.unknown.contains(&volume.name) => {
+                check.unknown.insert(volume.name);
+            }
             Err(error) => check.not_understood(volume.name, &error),
         }
     }
-    check.orphans(&objects).await?;
+    check.orphans().await?;
     check.recount().await?;
     let mut report = check.report;
     if options.quick {
@@ -209,6 +228,16 @@ struct Check<'a> {
     of_other_types: Vec<(Tile, Dtype)>,
     /// How many tiles of the volume at hand are of its type.
     of_its_type: u64,
+    /// What the storage has.
+    objects: &'a [Entry],
+    /// Which of it is of which volume's record, by the hashes of both; `None` until that is wanted.
+    by_record: Option<HashMap<u64, Vec<usize>>>,
+    /// What the changes tell of the tiles of the volume at hand.
+    history: History,
+    /// Volumes that the acquisition at hand is not of.
+    of_others: HashSet<String>,
+    /// Pyramids that a repair had their own tiles name again.
+    renamed: HashSet<String>,
 }
 
 impl Check<'_> {
@@ -216,6 +245,7 @@ impl Check<'_> {
         let catalog = self.archive.catalog();
         let volume = &entry.volume;
         let before = self.report.tiles;
+        self.history = catalog.history(&volume.name).await?;
         self.read_up_to(entry).await?;
         self.read_records(entry).await;
         self.described(entry);
@@ -247,6 +277,7 @@ impl Check<'_> {
             self.spoilt(entry, spoilt).await?;
         }
         self.half_deleted(entry).await?;
+        self.undeleted(entry).await?;
         self.of_other_types(entry).await?;
         self.lost(entry).await?;
         self.spoilt_waiting(entry).await?;
@@ -357,9 +388,18 @@ impl Check<'_> {
         if self.given_back.contains(&known) {
             return Ok(());
         }
+        if self.history.was_deleted(tile.id, tile.revision) {
+            return self.end_again(entry, &tile.name, &tile.pyramid).await;
+        }
+        if self.unrecorded(entry, tile).await? {
+            return Ok(());
+        }
         if let Some(reason) = self.contradicted(entry, tile) {
             self.named.insert(self.hasher.hash_one(&tile.pyramid));
             return self.mend(FindingKind::Spoilt, entry, tile, reason).await;
+        }
+        if self.misnamed(entry, tile, &looked).await? {
+            return Ok(());
         }
         let extent = entry.volume.extent();
         if place(extent, tile.section, tile.size, tile.transform).is_none() {
@@ -401,6 +441,9 @@ impl Check<'_> {
                 ..
             }) => (FindingKind::Missing, "the pyramid is not there".to_owned()),
             Err(PyramidError::Storage { source, .. }) => match source {
+                StorageError::Occupied { .. } if Name::of(&tile.pyramid).is_none() => {
+                    return self.names_folder(entry, tile).await;
+                }
                 // Ingest could not write there either: it is a person's to mend, and is only told.
                 StorageError::Occupied { .. } => {
                     let reason =
@@ -434,7 +477,14 @@ impl Check<'_> {
         tile: &Tile,
         mut reason: String,
     ) -> Result<(), CheckError> {
+        if let Some(own) = self.own_pyramid(entry, tile).await? {
+            return self.rename_pyramid(kind, entry, tile, own, reason).await;
+        }
         let position = self.position(entry, tile).await?;
+        // What there is of it is kept until it is whole again.
+        if let Some(position) = position.filter(|at| position_of(&tile.pyramid) != Some(*at)) {
+            self.kept.insert((entry.volume.name.clone(), position));
+        }
         let source = self.source(entry, Some(&tile.name), position);
         // Without a repair, what is at hand is told only where it will not do.
         if self.options.repair || matches!(source, Source::ImageGone(_)) {

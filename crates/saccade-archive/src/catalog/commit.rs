@@ -1,5 +1,6 @@
 //! One transaction: everything in it happens, or nothing.
 
+mod rectified;
 mod remembered;
 mod undeleted;
 

@@ -70,6 +70,32 @@ impl Catalog {
         self.ask(question, &values, rows::origin).await
     }
 
+    /// Which records say what a tile is.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn origin(&self, volume: &str, tile: TileId) -> Result<Option<Origin>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT name, position, transform_position FROM tiles \
+                        WHERE volume = $1 AND id = $2 AND deleted = 0";
+        let values = [id.into(), tile.0.into()];
+        Ok(self.ask(question, &values, rows::origin).await?.pop())
+    }
+
+    /// Whether a row has a tile's name, be the tile there or deleted.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn has_row(&self, volume: &str, tile: &str) -> Result<bool, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id FROM tiles WHERE volume = $1 AND name = $2";
+        let values = [id.into(), tile.into()];
+        let found = self.ask(question, &values, |row| row.get::<i64>("id"));
+        Ok(!found.await?.is_empty())
+    }
+
     /// What brought the tiles of a section to where they lie; those of which it cannot be understood are left out.
     ///
     /// # Errors

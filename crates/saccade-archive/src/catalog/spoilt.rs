@@ -140,6 +140,35 @@ impl Catalog {
             .await
     }
 
+    /// Rows after one, by their numbers, of tiles that are said to be deleted as deletions leave those that were there, some
+    /// thousand at once: the last row's number, and the tiles, which name no pyramid of theirs, with their rows' positions; without
+    /// what cannot be understood.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn deleted_after(
+        &self,
+        volume: &str,
+        row: i64,
+    ) -> Result<Option<(i64, Vec<(Tile, u64)>)>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                        'none' AS pyramid, revision, position FROM tiles \
+                        WHERE volume = $1 AND id > $2 AND deleted <> 0 AND pyramid = '' AND width > 0 \
+                        ORDER BY id LIMIT 4096";
+        let deleted = |row: &Row| {
+            let tile = rows::tile_or_spoilt(row)?.ok();
+            let position = rows::unsigned(row, "position").ok();
+            Ok((row.get::<i64>("id")?, tile.zip(position)))
+        };
+        let values = [id.into(), row.into()];
+        let rows = self.ask(question, &values, deleted).await?;
+        let last = rows.last().map(|(row, _)| *row);
+        let tiles = rows.into_iter().filter_map(|(_, tile)| tile).collect();
+        Ok(last.map(|last| (last, tiles)))
+    }
+
     /// Whether anything is known of a tile: it is there, or was deleted, or waits, or is in quarantine.
     ///
     /// # Errors

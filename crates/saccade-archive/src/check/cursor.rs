@@ -1,11 +1,12 @@
 //! How far the records of a volume were read.
 
+use std::collections::HashSet;
 use std::path::Path;
 
 use super::records::AT_ONCE;
 use super::{Check, CheckError, FindingKind, Repair};
 use crate::acquisition::{AcquisitionError, AcquisitionInfo, Cursor, Record, RecordReader};
-use crate::catalog::{CatalogError, VolumeEntry};
+use crate::catalog::{CatalogError, Listed, VolumeEntry};
 
 /// Newest tiles of a volume whose records are looked for among those that may be its own.
 const KNOWN_BY: u32 = 8;
@@ -18,7 +19,7 @@ impl Check<'_> {
         let mut reason = match catalog.cursor(&entry.volume.name).await {
             Ok(read) => {
                 self.read = Some(read);
-                let Some(misread) = self.misread(entry, read) else {
+                let Some(misread) = self.misread(entry, read).await? else {
                     return Ok(());
                 };
                 let more = match self.are_its_own(entry).await? {
@@ -55,45 +56,82 @@ impl Check<'_> {
     }
 
     /// Why a volume's records were not read up to where the catalog says, if they are at hand.
-    fn misread(&self, entry: &VolumeEntry, read: Cursor) -> Option<String> {
-        let folder = self.folder_of(entry).filter(|_| read.offset > 0)?;
-        // Of several volumes, an acquisition is one's.
-        let is_its =
-            || AcquisitionInfo::read(&folder).is_ok_and(|info| info.name == entry.volume.name);
-        let is_there = folder.join(RecordReader::FILE).is_file();
-        if !is_there || !(self.known.len() == 1 || is_its()) {
-            return None;
+    async fn misread(
+        &self,
+        entry: &VolumeEntry,
+        read: Cursor,
+    ) -> Result<Option<String>, CheckError> {
+        let folder = self.folder_of(entry);
+        let Some(folder) = folder.filter(|folder| folder.join(RecordReader::FILE).is_file()) else {
+            return Ok(None);
+        };
+        if read.offset > 0 {
+            return Ok(misread_in(&folder, read));
         }
-        let mut reader = RecordReader::new(&folder, read);
-        let at = format!(
-            "the catalog says that its records were read up to byte {}",
-            read.offset
-        );
-        match reader.recognize() {
-            Err(AcquisitionError::RecordsCut { len, .. }) => {
-                Some(format!("{at}, but they have {len} bytes"))
+        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
+        let last = catalog.last_position(volume).await?;
+        // Another may have begun meanwhile.
+        let still = catalog.cursor(volume).await?.offset == 0;
+        Ok(last.filter(|_| still).map(|last| {
+            format!("the catalog says that none of its records was read, but has what the one at byte {last} says")
+        }))
+    }
+
+    /// Finds out of which of several volumes the acquisition at hand is: that whose newest tiles are of its records, whatever
+    /// name it was taken in under; if none is, that of its name.
+    pub(super) async fn find_owner(&mut self, volumes: &[Listed]) -> Result<(), CheckError> {
+        let Some(folder) = self
+            .options
+            .acquisition
+            .clone()
+            .filter(|_| volumes.len() > 1)
+        else {
+            return Ok(());
+        };
+        let mut owners = HashSet::new();
+        for Listed { name, entry } in volumes {
+            let is_its = match entry {
+                Ok(_) => self.is_most(&folder, name).await?,
+                Err(_) => Some(false),
+            };
+            // One that lost all of its tiles may know what was read.
+            let is_known = async || match self.archive.catalog().cursor(name).await {
+                Ok(read) if read.offset > 0 && read.seen.is_some() => {
+                    RecordReader::new(&folder, read).recognize().is_ok()
+                }
+                _ => false,
+            };
+            if match is_its {
+                Some(is_its) => is_its,
+                None => is_known().await,
+            } {
+                owners.insert(name.clone());
             }
-            Err(AcquisitionError::RecordsReplaced { .. }) => Some(format!(
-                "{at}, but what lies before that is not what was read"
-            )),
-            Err(_) => None,
-            Ok(_) => match reader.is_between_lines() {
-                Ok(false) => Some(format!("{at}, but that is in the midst of a line")),
-                // What cannot be read says nothing.
-                Ok(true) | Err(_) => None,
-            },
         }
+        if owners.is_empty() {
+            let info = AcquisitionInfo::read(&folder).ok();
+            owners.extend(info.map(|info| info.name));
+        }
+        let others = volumes.iter().filter(|of| !owners.contains(&of.name));
+        self.of_others = others.map(|of| of.name.clone()).collect();
+        Ok(())
+    }
+
+    /// Whether most of the newest tiles of a volume are of these records; `None` if it has none.
+    async fn is_most(&self, folder: &Path, volume: &str) -> Result<Option<bool>, CheckError> {
+        let newest = self.archive.catalog().newest_records(volume, KNOWN_BY);
+        let newest = newest.await?;
+        let is_of = |(tile, at): &&(String, u64)| matches!(record_at(folder, *at), Some(Record::Tile(record)) if record.tile == *tile);
+        let own = newest.iter().filter(is_of).count();
+        Ok((!newest.is_empty()).then_some(own * 2 > newest.len()))
     }
 
     /// Whether the records at hand are those of which the newest tiles of a volume were taken in.
     async fn are_its_own(&self, entry: &VolumeEntry) -> Result<bool, CheckError> {
-        let Some(folder) = self.folder_of(entry) else {
-            return Ok(false);
-        };
-        let catalog = self.archive.catalog();
-        let newest = catalog.newest_records(&entry.volume.name, KNOWN_BY).await?;
-        let is_of = |(tile, at): &(String, u64)| matches!(record_at(&folder, *at), Some(Record::Tile(record)) if record.tile == *tile);
-        Ok(newest.iter().all(is_of))
+        match self.folder_of(entry) {
+            Some(folder) => Ok(self.is_most(&folder, &entry.volume.name).await? != Some(false)),
+            None => Ok(false),
+        }
     }
 
     /// The end of the last record of which the catalog has anything. What of those after it was read already says nothing
@@ -124,6 +162,29 @@ impl Check<'_> {
                 return Ok(Some(next));
             }
         }
+    }
+}
+
+/// Why records were not read up to a place in them, as far as can be told.
+fn misread_in(folder: &Path, read: Cursor) -> Option<String> {
+    let mut reader = RecordReader::new(folder, read);
+    let at = format!(
+        "the catalog says that its records were read up to byte {}",
+        read.offset
+    );
+    match reader.recognize() {
+        Err(AcquisitionError::RecordsCut { len, .. }) => {
+            Some(format!("{at}, but they have {len} bytes"))
+        }
+        Err(AcquisitionError::RecordsReplaced { .. }) => Some(format!(
+            "{at}, but what lies before that is not what was read"
+        )),
+        Err(_) => None,
+        Ok(_) => match reader.is_between_lines() {
+            Ok(false) => Some(format!("{at}, but that is in the midst of a line")),
+            // What cannot be read says nothing.
+            Ok(true) | Err(_) => None,
+        },
     }
 }
 

@@ -65,6 +65,12 @@ impl Check<'_> {
         entry: &VolumeEntry,
         tile: SpoiltTile,
     ) -> Result<(), CheckError> {
+        if let Ok(name) = &tile.name
+            && self.history.was_deleted(tile.id, 0)
+            && tile.pyramid.as_ref().is_err_and(String::is_empty)
+        {
+            return self.end_again(entry, name, "").await;
+        }
         let pyramid = tile.pyramid.as_ref().ok();
         let position = { tile.position }.or_else(|| position_of(pyramid?));
         if let Some(pyramid) = pyramid {

@@ -5,9 +5,11 @@
 
 use std::collections::HashMap;
 
+use saccade_core::voxel_box::VoxelBox;
+
 use super::{Check, CheckError, FindingKind, Repair, records::Said};
 use crate::acquisition::Record;
-use crate::catalog::{Placing, Tile, VolumeEntry, place};
+use crate::catalog::{ChangeReason, Placing, Tile, VolumeEntry, place};
 
 impl Check<'_> {
     /// Notes a tile that does not lie where its newest record says.
@@ -91,7 +93,71 @@ impl Check<'_> {
             tile.transform,
         )?;
         let came = now.change?;
-        (came.intersection(lies) != lies)
-            .then_some("it came elsewhere when it last changed, as the catalog's changes tell")
+        let elsewhere = "it came elsewhere when it last changed, as the catalog's changes tell";
+        if came.intersection(lies) != lies {
+            return Some(elsewhere);
+        }
+        let last = self.history.last(tile.id);
+        let last = last.filter(|last| last.change.revision == now.revision)?;
+        let is_explained = match last.change.reason {
+            ChangeReason::Transform => may_have_come(came, lies, last.before),
+            // One that is made anew stays where somebody has moved it.
+            ChangeReason::Tile => {
+                let (_, record) = self.record_at(entry, said.record)?;
+                let to = match record {
+                    Record::Tile(record) => record.transform,
+                    Record::Transform(record) => record.transform,
+                    Record::Delete(_) => return None,
+                };
+                let there = place(entry.volume.extent(), tile.section, tile.size, to);
+                let may_have_moved = last.was_moved || !self.history.is_whole();
+                there != Some(came) || (lies == came && may_have_moved)
+            }
+            ChangeReason::Deleted => true,
+        };
+        (!is_explained).then_some(elsewhere)
+    }
+}
+
+/// Whether a tile that moved may have come to a place, where the box around its old and its new place is `came`; `before` is
+/// the box of the change before, which brought it to the old one.
+fn may_have_come(came: VoxelBox, lies: VoxelBox, before: Option<VoxelBox>) -> bool {
+    let (at, all) = (lies.min.cmpeq(came.min), lies.max.cmpeq(came.max));
+    // Of two boxes of one size each touches a side of every axis.
+    if (at | all).all() {
+        return true;
+    }
+    before.is_none_or(|before| before.intersection(came).union(lies) == came)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::UVec3;
+
+    use super::*;
+
+    fn at(x: u32, y: u32, size: u32) -> VoxelBox {
+        let min = UVec3::new(x, y, 3);
+        VoxelBox::new(min, min + UVec3::new(size, size, 1))
+    }
+
+    #[test]
+    fn a_move_leads_from_one_corner_to_another_unless_its_tile_was_turned() {
+        let (old, new) = (at(10, 20, 64), at(31, 5, 64));
+        let came = old.union(new);
+        for before in [None, Some(old), Some(old.union(at(0, 0, 64)))] {
+            assert!(may_have_come(came, new, before));
+        }
+        assert!(!may_have_come(came, at(20, 12, 64), Some(old)));
+        assert!(may_have_come(came, at(20, 12, 64), None));
+        // From one that was turned, and is larger for that, to the midst of it.
+        let turned = at(3, 3, 91);
+        assert!(may_have_come(turned, at(20, 12, 64), Some(turned)));
+        // From far away: then its own place is all that changed.
+        assert!(!may_have_come(
+            at(300, 300, 64),
+            at(301, 301, 60),
+            Some(old)
+        ));
     }
 }

@@ -10,9 +10,9 @@ use crate::storage::Entry;
 
 impl Check<'_> {
     /// Finds what nothing names.
-    pub(super) async fn orphans(&mut self, objects: &[Entry]) -> Result<(), CheckError> {
+    pub(super) async fn orphans(&mut self) -> Result<(), CheckError> {
         let now = self.archive.catalog().clock().now();
-        for object in objects {
+        for object in self.objects {
             let volume = volume_of(&object.name).unwrap_or_default();
             if self.is_unknown(volume) || self.may_be_of_a_tile(&object.name) {
                 continue;

@@ -155,6 +155,22 @@ impl Records {
         said.filter(|said| said.hash != self.hasher.hash_one(bits(tile.transform)))
     }
 
+    /// Whether any record is of a tile's image, or of its end.
+    pub(super) fn know(&self, tile: &str) -> bool {
+        self.newest.contains_key(&self.hasher.hash_one(tile))
+    }
+
+    /// The position of the newest record of a tile's image, if it is not deleted since.
+    pub(super) fn newest_of(&self, tile: &str) -> Option<u64> {
+        let newest = self.newest.get(&self.hasher.hash_one(tile))?;
+        newest.image.map(|_| newest.position)
+    }
+
+    /// What says where a tile lies.
+    pub(super) fn said(&self, tile: &str) -> Option<Said> {
+        self.newest.get(&self.hasher.hash_one(tile))?.said
+    }
+
     /// Whether the newest of a tile's records is its end.
     pub(super) fn is_deleted(&self, tile: &str) -> bool {
         let newest = self.newest.get(&self.hasher.hash_one(tile));
@@ -288,7 +304,7 @@ impl Check<'_> {
     }
 
     /// Where a tile that is made anew is to lie, if a record said so after its own: nobody reads that one again.
-    async fn keep_place(
+    pub(super) async fn keep_place(
         &self,
         entry: &VolumeEntry,
         tile: &str,

@@ -2,25 +2,48 @@
 
 use std::path::PathBuf;
 
+use super::names::Name;
 use super::{Check, CheckError, FindingKind, Repair};
 use crate::acquisition::{Record, RecordReader, TileRecord, image_path};
 use crate::catalog::{Quarantined, Tile, VolumeEntry, Waiting};
 
 impl Check<'_> {
-    /// The position of the record that a tile's pyramid was made of, or is to be.
+    /// The position of the record that a tile's pyramid was made of, or is to be: what its name says, unless the records are at
+    /// hand and say that this is none of the tile's.
     pub(super) async fn position(
         &self,
         entry: &VolumeEntry,
         tile: &Tile,
     ) -> Result<Option<u64>, CheckError> {
-        if let Some(position) = position_of(&tile.pyramid) {
-            return Ok(Some(position));
+        let said = position_of(&tile.pyramid);
+        let is_its = |at: u64| match self.source(entry, Some(&tile.name), Some(at)) {
+            Source::There(..) | Source::ImageGone(_) => Some(true),
+            Source::NoRecord => Some(false),
+            Source::NoRecords => None,
+        };
+        if said.is_some_and(|said| is_its(said) != Some(false)) {
+            return Ok(said);
         }
-        // One that had another's, and was given back.
+        let others = self.other_positions(entry, tile).await?;
+        let its = others.iter().copied().find(|at| is_its(*at) == Some(true));
+        Ok(its.or(said).or(others.first().copied()))
+    }
+
+    /// Positions of records that may be a tile's and not its pyramid's: what its row says, and the newest of its name.
+    pub(super) async fn other_positions(
+        &self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+    ) -> Result<Vec<u64>, CheckError> {
         let catalog = self.archive.catalog();
-        let origins = catalog.origins(&entry.volume.name, &tile.pyramid).await?;
-        let own = origins.into_iter().find(|origin| origin.tile == tile.name);
-        Ok(own.map(|origin| origin.position))
+        let row = catalog.origin(&entry.volume.name, tile.id).await?;
+        let newest = { self.records.as_ref() }.and_then(|records| records.newest_of(&tile.name));
+        let said = row.map(|row| row.position).into_iter().chain(newest);
+        let name = Name::of(&tile.pyramid);
+        let is_own = |at: u64| {
+            name.is_some_and(|name| name.volume == entry.volume.name && name.position == at)
+        };
+        Ok(said.filter(|at| !is_own(*at)).collect())
     }
 
     /// Gives a tile back to ingest, or puts it into quarantine.
@@ -106,7 +129,9 @@ impl Check<'_> {
     pub(super) fn folder_of(&self, entry: &VolumeEntry) -> Option<PathBuf> {
         let kept = { self.options.watched.iter() }.map(|all| all.join(&entry.volume.name));
         let mut kept = kept.filter(|folder| folder.join(RecordReader::FILE).is_file());
-        kept.next().or_else(|| self.options.acquisition.clone())
+        let is_anothers = self.of_others.contains(&entry.volume.name);
+        let asked = || self.options.acquisition.clone().filter(|_| !is_anothers);
+        kept.next().or_else(asked)
     }
 
     /// The record at a position, and the folder of its acquisition, if the records are those that were read.

@@ -51,6 +51,8 @@ impl Finding {
                     | Repair::Reread
                     | Repair::Reindexed
                     | Repair::Restored
+                    | Repair::Renamed
+                    | Repair::TakenAway
             )
         )
     }
@@ -92,7 +94,7 @@ pub enum Repair {
     Deleted,
     /// The tile's record waits for ingest, which makes the pyramid anew.
     Queued,
-    /// The tiles were counted anew.
+    /// The tiles, or the changes, were counted anew.
     Recounted,
     /// The tile lies where its records say.
     Moved,
@@ -100,6 +102,10 @@ pub enum Repair {
     Kept,
     /// The tile is no longer called deleted.
     Restored,
+    /// The tile has its own name, or names its own pyramid, again.
+    Renamed,
+    /// The tile is none, or was deleted before, and is taken away.
+    TakenAway,
     /// How far the records were read is found out from them: ingest goes on from there.
     Reread,
     /// The indexes of the catalog's file are made anew, and it is sound.

@@ -47,7 +47,7 @@ impl Check<'_> {
     }
 
     /// Takes a pyramid that is not its own from a tile, and has it made anew.
-    async fn give_back(
+    pub(super) async fn give_back(
         &self,
         entry: &VolumeEntry,
         origin: &Origin,

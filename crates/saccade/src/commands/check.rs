@@ -31,8 +31,8 @@ pub(crate) struct Check {
     quick: bool,
 
     /// Delete pyramids that nothing has named for an hour; move tiles that lie outside of the volume, or where nothing says
-    /// that they do, to where their records say; bring back tiles that are called deleted and are not as a deletion leaves
-    /// them; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back to
+    /// that they do, to where their records say; bring back tiles that are called deleted and that no deletion took, and
+    /// take those away that one did; have tiles name their own pyramids; make tables anew that the catalog has lost; give tiles that are damaged, or name another's pyramid, back to
     /// `saccade ingest`, or set them aside if --acquisition does not help [default: change nothing]
     #[arg(long)]
     repair: bool,
@@ -152,6 +152,8 @@ fn line(finding: &Finding) -> String {
         Some(Repair::Recounted) => "; counted anew",
         Some(Repair::Kept) => "; it is kept",
         Some(Repair::Restored) => "; it is brought back",
+        Some(Repair::Renamed) => "; its name is mended, and nothing is lost",
+        Some(Repair::TakenAway) => "; taken away",
         Some(Repair::Reindexed) => "; its indexes are made anew, and it is sound",
         Some(Repair::Reread) => "; `saccade ingest` goes on from what it has",
         Some(Repair::Moved) => "; moved to where its records say",

@@ -4,7 +4,8 @@ use super::Commit;
 use crate::catalog::{CatalogError, ChangeReason, Tile};
 
 impl Commit<'_> {
-    /// Brings a tile back whose row is called deleted and is whole otherwise, as [`half_deleted`] finds them.
+    /// Brings a tile back whose row is called deleted and is whole otherwise, as [`half_deleted`] finds them, or names
+    /// none: then it gets the one that is said.
     ///
     /// # Errors
     ///
@@ -15,8 +16,8 @@ impl Commit<'_> {
         let place = self.place(&tile.name, tile.section, tile.size, tile.transform)?;
         self.log_change(tile.id, None, Some(place), ChangeReason::Tile)
             .await?;
-        let update = "UPDATE tiles SET deleted = 0, revision = $3 WHERE id = $1 AND volume = $2 \
-                      AND deleted <> 0 AND pyramid = $4";
+        let update = "UPDATE tiles SET deleted = 0, revision = $3, pyramid = $4 WHERE id = $1 AND volume = $2 \
+                      AND deleted <> 0 AND (pyramid = $4 OR pyramid = '')";
         let values = [
             tile.id.0.into(),
             self.volume.into(),

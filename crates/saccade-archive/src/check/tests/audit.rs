@@ -7,7 +7,7 @@ use crate::acquisition::{AcquisitionInfo, DeleteRecord, TransformRecord};
 use crate::image::GrayImage16;
 
 impl Fixture {
-    async fn look(&self, repair: bool) -> CheckReport {
+    pub(super) async fn look(&self, repair: bool) -> CheckReport {
         let options = CheckOptions {
             repair,
             acquisition: Some(self.acquisition.path().to_owned()),
@@ -31,28 +31,28 @@ impl Fixture {
         position
     }
 
-    async fn cursor(&self) -> Cursor {
+    pub(super) async fn cursor(&self) -> Cursor {
         self.archive.catalog().cursor(VOLUME).await.unwrap()
     }
 
-    async fn set_cursor(&self, read: Cursor) {
+    pub(super) async fn set_cursor(&self, read: Cursor) {
         let mut commit = self.archive.catalog().begin(VOLUME).await.unwrap();
         commit.cursor(read).await.unwrap();
         commit.finish().await.unwrap();
     }
 
-    async fn transform(&self, tile: &str) -> SectionFromTile {
+    pub(super) async fn transform(&self, tile: &str) -> SectionFromTile {
         let tile = self.archive.catalog().tile(VOLUME, tile).await.unwrap();
         tile.unwrap().transform
     }
 }
 
-fn repairs(report: &CheckReport) -> Vec<(FindingKind, Option<Repair>)> {
+pub(super) fn repairs(report: &CheckReport) -> Vec<(FindingKind, Option<Repair>)> {
     let all = report.findings.iter().map(|f| (f.kind, f.repair));
     all.collect()
 }
 
-fn at(x: f64) -> SectionFromTile {
+pub(super) fn at(x: f64) -> SectionFromTile {
     SectionFromTile::translation(DVec2::new(x, 7.0))
 }
 

@@ -1,0 +1,71 @@
+//! Rows that say what nothing explains, made to say what they did.
+
+use super::Commit;
+use crate::catalog::{CatalogError, ChangeReason, Tile, place};
+
+impl Commit<'_> {
+    /// Has a tile name another pyramid, if it is still as it was found. The one that it named is not retired: it is another's.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn rename_pyramid(&mut self, tile: &Tile, to: &str) -> Result<(), CatalogError> {
+        self.log_again(tile).await?;
+        let update = "UPDATE tiles SET pyramid = $4, revision = $5 \
+                      WHERE id = $1 AND volume = $2 AND pyramid = $3 AND deleted = 0";
+        let values = [
+            tile.id.0.into(),
+            self.volume.into(),
+            (&tile.pyramid).into(),
+            to.into(),
+            self.revision.into(),
+        ];
+        self.run(update, &values).await?;
+        self.forget_retired(to).await
+    }
+
+    /// Gives a tile another name, if it is still as it was found and no row has that name.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn rename(&mut self, tile: &Tile, to: &str) -> Result<(), CatalogError> {
+        self.log_again(tile).await?;
+        let update = "UPDATE tiles SET name = $4, revision = $5 \
+                      WHERE id = $1 AND volume = $2 AND name = $3 AND deleted = 0 \
+                      AND NOT EXISTS (SELECT 1 FROM tiles t WHERE t.volume = $2 AND t.name = $4)";
+        let values = [
+            tile.id.0.into(),
+            self.volume.into(),
+            (&tile.name).into(),
+            to.into(),
+            self.revision.into(),
+        ];
+        self.run(update, &values).await?;
+        Ok(())
+    }
+
+    /// Takes a tile away that is none, or was deleted before, and leaves the pyramid that it names to others.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn take_away(&mut self, tile: &str) -> Result<(), CatalogError> {
+        let Some(existing) = self.existing(tile).await?.filter(|e| !e.deleted) else {
+            return Ok(());
+        };
+        self.log_change(existing.id, existing.place, None, ChangeReason::Deleted)
+            .await?;
+        let update = "UPDATE tiles SET deleted = 1, pyramid = '', revision = $2 WHERE id = $1";
+        let values = [existing.id.0.into(), self.revision.into()];
+        self.run(update, &values).await?;
+        // Nobody knows whether it was counted.
+        self.uncounted = true;
+        Ok(())
+    }
+
+    async fn log_again(&mut self, tile: &Tile) -> Result<(), CatalogError> {
+        let at = place(self.extent, tile.section, tile.size, tile.transform);
+        self.log_change(tile.id, at, at, ChangeReason::Tile).await
+    }
+}

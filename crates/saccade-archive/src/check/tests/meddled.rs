@@ -1,0 +1,396 @@
+//! Rows that were changed by hand, and of which something else tells what they said.
+
+use super::audit::{at, repairs};
+use super::*;
+use crate::acquisition::AcquisitionInfo;
+
+const OTHER: &str = "w";
+
+impl Fixture {
+    /// One more volume, with one tile.
+    async fn other_volume(&self) -> String {
+        let catalog = self.archive.catalog();
+        let volume = Volume::new(OTHER, UVec3::new(900, 900, 8), DVec3::ONE).unwrap();
+        catalog.create_volume(&volume).await.unwrap();
+        let object = "tiles/w/000000/u0-0.tif".to_owned();
+        let bytes = pyramid::named(fs::read(self.path(0)).unwrap().into(), &object).unwrap();
+        let written = self.archive.storage().write_durable(&object, bytes);
+        written.await.unwrap();
+        let tile = NewTile {
+            name: "u0".to_owned(),
+            section: 0,
+            channel: 0,
+            size: UVec2::new(200, 150),
+            transform: at(3.0),
+            pyramid: object.clone(),
+            position: 0,
+        };
+        catalog.commit_tile(OTHER, &tile).await.unwrap();
+        object
+    }
+
+    /// Deletes a tile as `saccade update` does.
+    async fn delete(&self, tile: &str) {
+        let position = self.cursor().await.offset - 1;
+        let deleted = self.archive.catalog().delete_tile(VOLUME, tile, position);
+        deleted.await.unwrap();
+    }
+
+    /// As `look(true)`, without the records.
+    async fn repair_alone(&self) -> CheckReport {
+        let options = CheckOptions {
+            repair: true,
+            safe_age: Duration::ZERO,
+            ..CheckOptions::default()
+        };
+        check(&self.archive, &options, &|_, _| {}).await.unwrap()
+    }
+
+    async fn swap(&self, a: usize, b: usize) {
+        let name = |tile: usize, of: usize| {
+            format!(
+                "UPDATE tiles SET pyramid = '{}' WHERE name = 't{tile}'",
+                self.names[of]
+            )
+        };
+        self.meddle(&[&name(a, b), &name(b, a)]).await;
+    }
+}
+
+#[tokio::test]
+async fn of_tiles_that_only_their_rows_call_deleted_nothing_is_deleted() {
+    let forged = "UPDATE tiles SET deleted = 1, pyramid = '' WHERE name IN ('t2', 't3')";
+    let (t2, t3) = ((FindingKind::Spoilt, "t2"), (FindingKind::Spoilt, "t3"));
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture.delete("t5").await;
+    catalog.set_transform(VOLUME, "t3", at(44.0)).await.unwrap();
+    fixture.meddle(&[forged]).await;
+    for report in [fixture.check(false).await, fixture.look(false).await] {
+        assert_eq!(found(&report), [t2, t3]);
+        let reason = &report.findings[0].reason;
+        assert!(reason.contains("--repair"), "{reason}");
+    }
+    let back = (FindingKind::Spoilt, Some(Repair::Restored));
+    assert_eq!(repairs(&fixture.repair_alone().await), [back; 2]);
+    assert_eq!(fixture.look(true).await.findings, []);
+    assert_eq!(fixture.transform("t3").await, at(44.0));
+    assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, 5);
+
+    // One whose pyramid is not whole is made anew.
+    fixture.meddle(&[forged]).await;
+    fs::write(fixture.path(2), "damaged").unwrap();
+    let report = fixture.look(true).await;
+    let anew = (FindingKind::Spoilt, Some(Repair::Queued));
+    assert_eq!(repairs(&report), [anew, back]);
+    assert!(fixture.path(2).is_file());
+
+    // Where no change is kept nobody knows.
+    fixture.meddle(&[forged, "DELETE FROM changes"]).await;
+    let report = fixture.look(true).await;
+    let of_t3 = report
+        .findings
+        .iter()
+        .find(|f| f.tile.as_deref() == Some("t3"))
+        .unwrap();
+    assert_eq!((of_t3.kind, of_t3.repair), (FindingKind::Spoilt, None));
+    assert!(of_t3.reason.contains("nobody knows"), "{}", of_t3.reason);
+    assert!(fixture.path(3).is_file());
+    assert!(catalog.tile(VOLUME, "t3").await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn who_names_what_is_not_there_names_its_own_again() {
+    let fixture = Fixture::new().await;
+    let own = &fixture.names[2];
+    let position = position_of(own).unwrap();
+    let wrong = own.replace(
+        &format!("{position:x}.tif"),
+        &format!("{:x}.tif", position - 1),
+    );
+    let misname = format!("UPDATE tiles SET pyramid = '{wrong}' WHERE name = 't2'");
+    fixture.meddle(&[&misname]).await;
+    let report = fixture.check(false).await;
+    assert_eq!(found(&report), [(FindingKind::Missing, "t2")]);
+    assert!(report.findings[0].reason.contains(own));
+    let named = [(FindingKind::Missing, Some(Repair::Renamed))];
+    assert_eq!(repairs(&fixture.repair_alone().await), named);
+    assert_eq!(fixture.look(false).await.findings, []);
+    fixture.meddle(&[&misname]).await;
+    assert_eq!(repairs(&fixture.look(true).await), named);
+
+    // Where its own is damaged it is made anew, and what there is of it is kept while nothing better is.
+    fixture.meddle(&[&misname]).await;
+    fs::write(fixture.path(2), "damaged").unwrap();
+    let image = fixture.acquisition.path().join("t2.tif");
+    fs::rename(&image, image.with_extension("away")).unwrap();
+    let aside = [(FindingKind::Missing, Some(Repair::Quarantined))];
+    let report = fixture.look(true).await;
+    assert_eq!(repairs(&report), aside);
+    assert!(report.findings[0].reason.contains("\"t2.tif\""));
+    assert!(fixture.path(2).is_file());
+    fs::rename(image.with_extension("away"), &image).unwrap();
+    let anew = [(FindingKind::Missing, Some(Repair::Queued))];
+    assert_eq!(repairs(&fixture.look(true).await), anew);
+    assert!(fixture.path(2).is_file());
+}
+
+#[tokio::test]
+async fn nobody_is_told_to_take_a_folder_of_others_away() {
+    let fixture = Fixture::new().await;
+    let misname = "UPDATE tiles SET pyramid = 'tiles/v' WHERE name = 't2'";
+    fixture.meddle(&[misname]).await;
+    let report = fixture.check(false).await;
+    assert_eq!(found(&report), [(FindingKind::Spoilt, "t2")]);
+    let reason = &report.findings[0].reason;
+    assert!(!reason.contains("take it away"), "{reason}");
+    assert!(reason.contains(&fixture.names[2]), "{reason}");
+    let named = [(FindingKind::Spoilt, Some(Repair::Renamed))];
+    assert_eq!(repairs(&fixture.repair_alone().await), named);
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+#[tokio::test]
+async fn revisions_that_keep_others_from_writing_are_set() {
+    for says in ["3", "9223372036854775807", "-5"] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        let before = catalog.revision(VOLUME).await.unwrap();
+        let set = format!("UPDATE volumes SET revision = {says}");
+        fixture.meddle(&[&set]).await;
+        let report = fixture.check(false).await;
+        assert_eq!(repairs(&report), [(FindingKind::Spoilt, None)], "{says}");
+        let reason = &report.findings[0].reason;
+        assert!(
+            reason.contains(says) && reason.contains("--repair"),
+            "{reason}"
+        );
+        let report = fixture.look(true).await;
+        let counted = (FindingKind::Spoilt, Some(Repair::Recounted));
+        assert_eq!((repairs(&report), report.damage()), (vec![counted], 0));
+        assert_eq!(catalog.revision(VOLUME).await.unwrap(), before);
+        catalog.set_transform(VOLUME, "t1", at(40.0)).await.unwrap();
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+    // One that is larger keeps nobody from anything.
+    let fixture = Fixture::new().await;
+    fixture
+        .meddle(&["UPDATE volumes SET revision = 5000"])
+        .await;
+    assert_eq!(fixture.check(false).await.findings, []);
+}
+
+#[tokio::test]
+async fn records_of_which_there_are_tiles_were_read() {
+    let fixture = Fixture::new().await;
+    let mut reader = RecordReader::new(fixture.acquisition.path(), Cursor::default());
+    reader.read(9).unwrap();
+    let right = reader.cursor();
+    for seen in [None, right.seen] {
+        let none = Cursor {
+            seen,
+            ..Cursor::default()
+        };
+        fixture.set_cursor(none).await;
+        let report = fixture.look(false).await;
+        assert_eq!(repairs(&report), [(FindingKind::Spoilt, None)]);
+        let reason = &report.findings[0].reason;
+        assert!(reason.contains("none of its records"), "{reason}");
+        // Who goes on from there finds nothing that is another's.
+        let mut again = RecordReader::new(fixture.acquisition.path(), none);
+        assert_eq!(again.read(9).unwrap().len(), TILES as usize);
+        let read = (FindingKind::Spoilt, Some(Repair::Reread));
+        assert_eq!(repairs(&fixture.look(true).await), [read]);
+        assert_eq!(fixture.cursor().await, right);
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+}
+
+#[tokio::test]
+async fn who_names_anothers_alone_names_its_own_again() {
+    let fixture = Fixture::new().await;
+    let wrong = [(FindingKind::Mistaken, "t1"), (FindingKind::Mistaken, "t3")];
+    let named = (FindingKind::Mistaken, Some(Repair::Renamed));
+    fixture.swap(1, 3).await;
+    for report in [fixture.check(false).await, fixture.look(false).await] {
+        assert_eq!(found(&report), wrong);
+    }
+    for with_records in [false, true] {
+        fixture.swap(1, 3).await;
+        let report = match with_records {
+            false => fixture.repair_alone().await,
+            true => fixture.look(true).await,
+        };
+        assert_eq!(repairs(&report), [named; 2]);
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+    // One whose own is not whole gets it anew, and leaves the other's to that.
+    fixture.swap(1, 3).await;
+    fs::write(fixture.path(1), "damaged").unwrap();
+    let report = fixture.look(true).await;
+    let anew = (FindingKind::Mistaken, Some(Repair::Queued));
+    assert_eq!(repairs(&report), [anew, named]);
+    assert!(fixture.path(1).is_file());
+    let catalog = fixture.archive.catalog();
+    let t3 = catalog.origins(VOLUME, &fixture.names[3]).await.unwrap();
+    assert_eq!((t3.len(), &*t3[0].tile), (1, "t3"));
+}
+
+#[tokio::test]
+async fn pyramids_of_another_volume_are_that_ones() {
+    let fixture = Fixture::new().await;
+    let object = fixture.other_volume().await;
+    let misname = format!("UPDATE tiles SET pyramid = '{object}' WHERE name = 't0'");
+    fixture.meddle(&[&misname]).await;
+    let report = fixture.check(false).await;
+    assert_eq!(found(&report), [(FindingKind::Mistaken, "t0")]);
+    let reason = &report.findings[0].reason;
+    assert!(reason.contains("volume \"w\""), "{reason}");
+    let named = [(FindingKind::Mistaken, Some(Repair::Renamed))];
+    assert_eq!(repairs(&fixture.repair_alone().await), named);
+    assert_eq!(fixture.check(false).await.findings, []);
+    // Whoever deletes the tile does not delete the other's pyramid.
+    fixture.meddle(&[&misname]).await;
+    fixture.delete("t0").await;
+    let catalog = fixture.archive.catalog();
+    let later = catalog.clock().now() + Duration::from_secs(9);
+    assert_eq!(catalog.retired(VOLUME, later, 9).await.unwrap(), []);
+}
+
+#[tokio::test]
+async fn tiles_that_lie_within_what_changed_and_did_not_come_there_are_moved_back() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    for tile in ["t1", "t2", "t3"] {
+        catalog.set_transform(VOLUME, tile, at(90.0)).await.unwrap();
+    }
+    // Made anew, it stays where it was.
+    let t3 = catalog.tile(VOLUME, "t3").await.unwrap().unwrap();
+    let again = NewTile {
+        name: t3.name,
+        section: t3.section,
+        channel: 0,
+        size: t3.size,
+        transform: SectionFromTile::translation(DVec2::splat(3.0)),
+        position: position_of(&t3.pyramid).unwrap(),
+        pyramid: t3.pyramid,
+    };
+    catalog.commit_tile(VOLUME, &again).await.unwrap();
+    assert_eq!(fixture.transform("t3").await, at(90.0));
+    assert_eq!(fixture.look(true).await.findings, []);
+    fixture
+        .meddle(&[
+            "UPDATE tiles SET a = 0.5, d = 0.5, tx = 23, ty = 23 WHERE name = 't0'",
+            "UPDATE tiles SET tx = 50, ty = 5 WHERE name = 't1'",
+            "UPDATE tiles SET a = -1, tx = tx + 200 WHERE name = 't4'",
+        ])
+        .await;
+    let report = fixture.look(true).await;
+    let moved = (FindingKind::Spoilt, Some(Repair::Moved));
+    assert_eq!(repairs(&report), [moved; 3]);
+    let tiles: Vec<_> = found(&report).into_iter().map(|(_, tile)| tile).collect();
+    assert_eq!(tiles, ["t0", "t1", "t4"]);
+    for tile in ["t2", "t3"] {
+        assert_eq!(fixture.transform(tile).await, at(90.0));
+    }
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+#[tokio::test]
+async fn tiles_of_names_that_no_record_has_get_their_own_again_or_are_taken_away() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    catalog.set_transform(VOLUME, "t2", at(44.0)).await.unwrap();
+    let bogus = "UPDATE tiles SET name = 'bogus' WHERE name = 't2'";
+    fixture.meddle(&[bogus]).await;
+    let report = fixture.look(false).await;
+    assert_eq!(found(&report), [(FindingKind::Spoilt, "bogus")]);
+    let reason = &report.findings[0].reason;
+    assert!(
+        reason.contains("tile t2") && reason.contains("--repair"),
+        "{reason}"
+    );
+    let named = [(FindingKind::Spoilt, Some(Repair::Renamed))];
+    assert_eq!(repairs(&fixture.look(true).await), named);
+    assert_eq!(fixture.transform("t2").await, at(44.0));
+    assert!(fixture.path(2).is_file());
+
+    // One beside it is none.
+    let columns = "volume, section, width, height, a, b, c, d, tx, ty, pyramid, revision, position, transform_position";
+    let beside = format!(
+        "INSERT INTO tiles (name, {columns}) SELECT 'bogus', {columns} FROM tiles WHERE name = 't2'"
+    );
+    fixture
+        .meddle(&[&beside, "UPDATE volumes SET tiles = tiles + 1"])
+        .await;
+    let report = fixture.look(true).await;
+    let away = [(FindingKind::Spoilt, Some(Repair::TakenAway))];
+    assert_eq!(repairs(&report), away);
+    assert!(fixture.path(2).is_file());
+    assert!(catalog.tile(VOLUME, "bogus").await.unwrap().is_none());
+    assert_eq!(fixture.look(false).await.findings, []);
+
+    // Of one that has nothing of anybody's it is told what helps.
+    let nobodys = "UPDATE tiles SET name = 'nobodys', pyramid = 'tiles/v/000001/bogus-7.tif' WHERE name = 't2'";
+    fixture.meddle(&[nobodys]).await;
+    let report = fixture.look(true).await;
+    let told = report
+        .findings
+        .iter()
+        .find(|f| f.tile.as_deref() == Some("nobodys"))
+        .unwrap();
+    assert_eq!((told.kind, told.repair), (FindingKind::Spoilt, None));
+    assert!(told.reason.contains("`saccade update`"), "{}", told.reason);
+    assert!(!told.reason.contains("append"), "{}", told.reason);
+    assert!(fixture.path(2).is_file());
+}
+
+#[tokio::test]
+async fn records_are_of_the_volume_whose_tiles_they_are_of() {
+    let fixture = Fixture::new().await;
+    fixture.other_volume().await;
+    let catalog = fixture.archive.catalog();
+    let mut commit = catalog.begin(OTHER).await.unwrap();
+    let read = Cursor {
+        offset: 40,
+        line: 1,
+        seen: None,
+    };
+    commit.cursor(read).await.unwrap();
+    commit.finish().await.unwrap();
+    // It was taken in under another name.
+    let info = AcquisitionInfo::new(OTHER, UVec3::new(900, 900, 8), DVec3::ONE);
+    info.write(fixture.acquisition.path()).unwrap();
+    assert_eq!(fixture.look(false).await.findings, []);
+    let forget = "DELETE FROM tiles WHERE name = 't5'";
+    let count = "UPDATE volumes SET tiles = 5 WHERE name = 'v'";
+    fixture.meddle(&[forget, count]).await;
+    let report = fixture.look(false).await;
+    assert_eq!(found(&report), [(FindingKind::Lost, "t5")]);
+}
+
+#[tokio::test]
+async fn tiles_that_were_deleted_and_are_called_there_are_deleted_again() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture.delete("t2").await;
+    let with_pyramid = format!(
+        "UPDATE tiles SET deleted = 0, pyramid = '{}' WHERE name = 't2'",
+        fixture.names[2]
+    );
+    for back in [
+        "UPDATE tiles SET deleted = 0 WHERE name = 't2'",
+        &with_pyramid,
+    ] {
+        fixture.meddle(&[back]).await;
+        let report = fixture.look(false).await;
+        assert_eq!(found(&report), [(FindingKind::Spoilt, "t2")]);
+        let reason = &report.findings[0].reason;
+        assert!(reason.contains("deleted when it last changed"), "{reason}");
+        let away = [(FindingKind::Spoilt, Some(Repair::TakenAway))];
+        assert_eq!(repairs(&fixture.look(true).await), away);
+        assert!(catalog.tile(VOLUME, "t2").await.unwrap().is_none());
+        assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, 5);
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+}
