@@ -15,6 +15,8 @@ pub enum Part {
     Watch,
     /// Whoever takes it in.
     Ingest,
+    /// Records of which the image is not there, or not whole; the others are taken in meanwhile.
+    Images,
 }
 
 /// A reason, and since when.

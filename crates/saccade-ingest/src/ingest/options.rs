@@ -13,6 +13,8 @@ pub struct IngestOptions {
     /// A folder besides the acquisition archive's into which links to images may lead: the one that is watched,
     /// where a [`Watch`](crate::watch::Watch) keeps the records.
     pub linked: Option<PathBuf>,
+    /// The archive's folder, if it has one: those who look at the volume are not told where on this machine it lies.
+    pub folder: Option<PathBuf>,
     /// How pyramids are stored.
     pub encoding: Encoding,
     /// Pause between looks at the acquisition archive.
@@ -45,6 +47,7 @@ impl IngestOptions {
     pub const DEFAULT: Self = Self {
         volume: None,
         linked: None,
+        folder: None,
         encoding: Encoding::Jpeg { quality: 85 },
         poll: Duration::from_millis(250),
         once: false,

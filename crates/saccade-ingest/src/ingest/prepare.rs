@@ -18,6 +18,7 @@ use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::enter::{SetAside, retry};
 use super::images::Images;
+use super::reasons::Called;
 use super::{IngestError, IngestOptions};
 use crate::progress::Progress;
 use crate::sense::{CHECK, nonsense};
@@ -175,6 +176,8 @@ pub(super) struct Context<'a> {
     pub(super) catalog: &'a Catalog,
     pub(super) options: &'a IngestOptions,
     pub(super) progress: &'a dyn Progress,
+    /// What paths are called where others read of them.
+    pub(super) called: &'a Called,
     pub(super) set_aside: SetAside,
 }
 
@@ -187,12 +190,29 @@ impl Context<'_> {
         retry(self.catalog.clock(), self.options, self.progress, ask).await
     }
 
-    /// Makes a tile of a record, up to its durable pyramid.
+    /// Makes a tile of a record, up to its durable pyramid. Why it cannot be is said without paths of this machine: those
+    /// who look at the volume read it, wherever they are.
     pub(super) async fn tile(
         &self,
         record: TileRecord,
         position: u64,
     ) -> Result<Outcome, IngestError> {
+        let mut outcome = self.make(record, position).await?;
+        if let Outcome::Wait {
+            waiting: Waiting { reason, .. },
+            ..
+        }
+        | Outcome::Quarantine {
+            what: Unfit { reason, .. },
+            ..
+        } = &mut outcome
+        {
+            *reason = self.called.told(reason);
+        }
+        Ok(outcome)
+    }
+
+    async fn make(&self, record: TileRecord, position: u64) -> Result<Outcome, IngestError> {
         let refused = |reason, bytes| Ok(quarantine(self.images, &record, reason, bytes, None));
         let watched = self.images.are_watched();
         let Some(path) = self.images.path(&record.file) else {
@@ -243,7 +263,8 @@ impl Context<'_> {
         }
         if place(self.extent, section, size, transform).is_none() {
             let check = if watched {
-                "its name, --first, --pitch and --extent, or the list, --origin and --extent"
+                "its name, --first and --pitch, or the list; if the volume is too small, take the folder in under another \
+                 name (--volume NAME), with a larger --extent, and of a list with --origin"
             } else {
                 "its section, transform and the extent in volume.json"
             };

@@ -21,12 +21,13 @@ use super::earlier::Earlier;
 use super::enter::{COMMIT_AT_ONCE, Enter, SetAside, retry};
 use super::images::Images;
 use super::prepare::{Context, Stored};
+use super::reasons::{self, Called};
 use super::records::patiently;
 use super::supply::{Job, Supply};
 use super::waiting::WaitingRoom;
-use super::{IngestError, IngestOptions, process, reasons};
+use super::{IngestError, IngestOptions, process};
 use crate::cancel::Cancel;
-use crate::held_up::Heard;
+use crate::held_up::{Heard, HeldUp, Part};
 use crate::progress::{Meter, Progress, State};
 
 /// Longest pause between looks for workers of this machine that were killed.
@@ -116,6 +117,7 @@ pub async fn run(
     let (name, process) = (worker_name(), process::this().unwrap_or_default());
     let register = || catalog.register_process(&name, &process, options.lease);
     let worker = retry(clock, options, progress, register).await?;
+    let called = called(acquisition, archive, options);
     let mut ingest = Ingest {
         archive,
         options,
@@ -129,12 +131,14 @@ pub async fn run(
             catalog,
             options,
             progress,
+            called: &called,
             set_aside: SetAside::default(),
         },
         worker: &worker,
         reader,
         room: WaitingRoom::new(options.patience, options.poll, Vec::new()),
         earlier,
+        held_up: held_up.clone(),
         meter: Meter::new(clock.monotonic()),
         summary: Summary::default(),
         left: AtomicU64::new(0),
@@ -143,7 +147,6 @@ pub async fn run(
         let work = pin!(ingest.follow());
         let cancelled = pin!(cancel.cancelled());
         let alive = pin!(keep_alive(archive, &worker));
-        let called = called(acquisition, archive, options);
         let told = pin!(reasons::tell(
             archive,
             &volume.name,
@@ -169,16 +172,21 @@ pub async fn run(
 }
 
 /// What those who look from elsewhere need not know.
-fn called(
-    acquisition: &Path,
-    archive: &VisualizationArchive,
-    options: &IngestOptions,
-) -> reasons::Called {
-    let catalog = archive.catalog().location().to_string();
-    let linked = options.linked.as_deref().unwrap_or(acquisition);
-    let folders = [linked, acquisition].map(|path| path.display().to_string());
-    let [linked, acquisition] = folders.map(|path| (path, "the acquisition's folder"));
-    vec![(catalog, "the catalog"), linked, acquisition]
+fn called(acquisition: &Path, archive: &VisualizationArchive, options: &IngestOptions) -> Called {
+    let mut called = Called::default();
+    // What lies in another comes first.
+    called.call(&archive.catalog().location().to_string(), "the catalog");
+    let folders = [
+        (options.linked.as_deref(), "the acquisition's folder"),
+        (Some(acquisition), "the acquisition's folder"),
+        (options.folder.as_deref(), "the archive's folder"),
+    ];
+    for (path, name) in folders {
+        if let Some(path) = path {
+            called.call(&path.to_string_lossy(), name);
+        }
+    }
+    called
 }
 
 /// What people call this worker.
@@ -231,6 +239,7 @@ struct Ingest<'a> {
     reader: RecordReader,
     room: WaitingRoom,
     earlier: Option<Earlier>,
+    held_up: HeldUp,
     meter: Meter,
     summary: Summary,
     /// Records still to do, as far as this worker knows.
@@ -272,6 +281,9 @@ impl Ingest<'_> {
             self.take_up(came).await?;
             let due: VecDeque<_> = due.into_iter().map(Job::from).collect();
             let worked = self.work(due).await?;
+            let waits_for = self.room.waits_for(images);
+            self.held_up
+                .tell(Part::Images, waits_for.as_deref(), self.clock().now());
             self.delete_retired().await?;
             let (queued, waiting) = self.count().await?;
             self.left

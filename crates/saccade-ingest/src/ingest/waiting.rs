@@ -135,6 +135,21 @@ impl WaitingRoom {
         told
     }
 
+    /// Which images people know to be waited for, in words.
+    pub(super) fn waits_for(&self, images: Images<'_>) -> Option<String> {
+        let mut told = self.records.values().filter(|guest| guest.told);
+        let Waiting { record, reason, .. } = &told.next()?.waiting;
+        let first = format!(
+            "{} (tile {}): {reason}",
+            images.name(&record.file),
+            record.tile
+        );
+        Some(match 1 + told.count() {
+            1 => format!("an image is waited for: {first}"),
+            all => format!("{all} images are waited for, such as {first}"),
+        })
+    }
+
     /// Records that were given up since there was no file, of which there is one now.
     pub(super) fn came(&mut self, images: Images<'_>) -> Vec<Waiting> {
         self.absent.came(images)
@@ -303,6 +318,7 @@ mod tests {
             assert!(room.due(images(&folder), 0).is_empty());
             let now = room.news(images(&folder));
             assert!(now.is_empty() || poll == 8, "poll {poll}: {now:?}");
+            assert_eq!(room.waits_for(images(&folder)).is_some(), poll >= 8);
             told.extend(now);
         }
         assert_eq!(told.len(), 4, "{told:?}");
@@ -314,6 +330,21 @@ mod tests {
             room.due(images(&folder), 0);
             assert!(room.news(images(&folder)).is_empty());
         }
+        let why = room.waits_for(images(&folder)).unwrap();
+        assert_eq!(
+            why,
+            "5 images are waited for, such as 0.tif (tile 0.tif): it ends early"
+        );
+        for n in 0..4 {
+            room.leave(n);
+        }
+        let why = room.waits_for(images(&folder)).unwrap();
+        assert_eq!(
+            why,
+            "an image is waited for: 4.tif (tile 4.tif): it ends early"
+        );
+        room.leave(4);
+        assert_eq!(room.waits_for(images(&folder)), None);
     }
 
     #[test]

@@ -21,4 +21,5 @@ mod replaced;
 mod scope;
 mod spoilt;
 mod stream;
+mod told;
 mod workers;
