@@ -114,6 +114,8 @@ fn tile(text: &str, dimensions: usize, line: u64) -> Result<ListedTile, String> 
         corner: DVec2::new(numbers[0], numbers[1]),
         section,
         line,
+        // A parenthesis ends them.
+        may_be_cut: false,
     })
 }
 

@@ -21,6 +21,8 @@ pub struct ListedTile {
     pub section: u32,
     /// Its line in the list, from 1.
     pub line: u64,
+    /// Whether the list ends right behind its last number, of which more may be about to be written.
+    pub may_be_cut: bool,
 }
 
 impl ListedTile {
@@ -73,6 +75,10 @@ pub fn parse(bytes: &[u8], path: &Path) -> Result<Vec<ListedTile>, AcquisitionEr
             reason,
             path: path.to_owned(),
         })?);
+    }
+    let lines = text.lines().count() as u64;
+    if let Some(last) = tiles.last_mut().filter(|last| last.line == lines) {
+        last.may_be_cut = text.ends_with(|c: char| !c.is_whitespace());
     }
     Ok(tiles)
 }
@@ -131,6 +137,7 @@ fn listed(text: &str, line: u64) -> Result<ListedTile, String> {
         corner,
         section,
         line,
+        may_be_cut: false,
     })
 }
 
@@ -202,6 +209,20 @@ impl Images {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_number_that_nothing_ends_may_be_cut() {
+        let cut = |text: &str| {
+            let tiles = parse(text.as_bytes(), Path::new("list.txt")).unwrap();
+            tiles.iter().map(|tile| tile.may_be_cut).collect::<Vec<_>>()
+        };
+        assert_eq!(cut("a.tif 0 0 0\nb.tif 0 0 10"), [false, true]);
+        for ended in ["\n", "\r", " ", "\r\n"] {
+            assert_eq!(cut(&format!("a.tif 0 0 10{ended}")), [false], "{ended:?}");
+        }
+        assert_eq!(cut("a.tif 0 0 10\n# no more"), [false]);
+        assert!(cut("# none").is_empty());
+    }
 
     #[test]
     fn blanks_comments_and_columns() {

@@ -104,10 +104,14 @@ pub(crate) struct List {
     pub(crate) stage: Option<Stage>,
     /// What of it does not count, or otherwise than it is written, in words.
     pub(crate) notes: Vec<String>,
+    /// The last line, if the list ends in a number of which more may be about to be written.
+    pub(crate) cut_at: Option<u64>,
 }
 
 impl List {
     fn of_lines(tiles: Vec<ListedTile>, solution: Option<Solution>, path: &Path) -> Self {
+        let cut_at = tiles.last().filter(|tile| tile.may_be_cut);
+        let cut_at = cut_at.map(|tile| tile.line);
         let (tiles, note) = twice::lines_once(tiles, path);
         Self {
             tiles: tiles.into_iter().map(Listed::from).collect(),
@@ -115,6 +119,7 @@ impl List {
             solution,
             stage: None,
             notes: note.into_iter().collect(),
+            cut_at,
         }
     }
 
@@ -377,5 +382,6 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
         }),
         stage: Some(stage),
         notes,
+        cut_at: None,
     }
 }

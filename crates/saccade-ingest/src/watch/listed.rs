@@ -8,7 +8,7 @@
 //! some of the tiles only: the others stay where the list has them.
 //!
 //! A list that names tiles no more may be half of one that is being written. Nothing of it counts before it has rested for
-//! [`ListConfig::drop_after`].
+//! [`ListConfig::drop_after`]. Neither does one whose last line may be cut within a number.
 //!
 //! # Channels
 //!
@@ -118,11 +118,15 @@ pub struct ListWatch<F> {
     disk: F,
     folder: PathBuf,
     kept: PathBuf,
+    /// Whether all is said to be there: it is followed to its end, once.
+    once: bool,
     index: Index,
     files: Files,
     trouble: Option<Trouble>,
     frame: Option<Frame>,
     adopted: Option<Adopted>,
+    /// Where registration's places are, as it was said last.
+    registration_said: Option<PathBuf>,
     /// How far registration's places are moved, as it was said last.
     shift_said: Option<DVec2>,
     /// The list of records, while this process is the one that writes it.
@@ -140,8 +144,8 @@ pub struct ListWatch<F> {
     unclear: BTreeSet<Arc<str>>,
     /// How many that were when it was said, and how.
     unclear_said: Option<(usize, String)>,
-    /// What is said of tiles that the list names no more, until they are deleted.
-    dropping: Option<String>,
+    /// What is said of a list that may not be whole, until it is read.
+    unsure: Option<String>,
     /// How many tiles registration does not know, as it was said last.
     unsolved_said: usize,
     /// Whether it was said why a solution is not used.
@@ -196,11 +200,13 @@ impl<F: Folders> ListWatch<F> {
         }
         let now = disk.now();
         let mut watch = Self {
+            once: false,
             index: Index::new(&folder),
             files: Files::new(&config.list),
             trouble: None,
             adopted: frame.as_ref().and_then(|_| frame::adopted(&folder, kept)),
             frame,
+            registration_said: None,
             shift_said: None,
             records: None,
             tiles: BTreeMap::new(),
@@ -210,7 +216,7 @@ impl<F: Folders> ListWatch<F> {
             missing_said: None,
             unclear: BTreeSet::new(),
             unclear_said: None,
-            dropping: None,
+            unsure: None,
             unsolved_said: 0,
             unused_said: false,
             unfit: None,

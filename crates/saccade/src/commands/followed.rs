@@ -62,8 +62,8 @@ pub(crate) struct Bare {
     #[arg(long, value_name = "NUMBER", value_parser = scale)]
     pixel: Option<f64>,
 
-    /// For how long a list must not have changed [s] before tiles are deleted that it names no more: who writes it anew,
-    /// slowly or with pauses, may not have come to them [default: 30]
+    /// For how long a list must not have changed [s] before tiles are deleted that it names no more, or before it is told
+    /// that it makes no sense at the start: who writes it, slowly or with pauses, may not have come to the end [default: 30]
     #[arg(long, value_name = "SECONDS", value_parser = clap::value_parser!(u32).range(1..=86_400), conflicts_with = "pattern")]
     drop_after: Option<u32>,
 
@@ -87,10 +87,8 @@ pub(crate) struct Bare {
     bits: Option<u8>,
 }
 
-/// Whether what keeps a folder from being followed is a file that was written just now, and may not be whole yet.
-pub(crate) fn is_being_written(error: &anyhow::Error) -> bool {
-    /// For how long what is whole has not changed.
-    const SETTLED: Duration = Duration::from_secs(5);
+/// Whether what keeps a folder from being followed is a file that has changed within `settled`, and may not be whole yet.
+pub(crate) fn is_being_written(error: &anyhow::Error, settled: Duration) -> bool {
     let files = error.chain().filter_map(|cause| {
         let shared = cause.downcast_ref::<Arc<AcquisitionError>>();
         let found = { cause.downcast_ref() }.or(shared.map(AsRef::as_ref))?;
@@ -101,7 +99,7 @@ pub(crate) fn is_being_written(error: &anyhow::Error) -> bool {
         let written = file.modified().ok();
         // One of a time that is to come has not changed for long.
         let ago = written.and_then(|at| SystemClock.now().duration_since(at).ok());
-        ago.is_some_and(|ago| ago < SETTLED)
+        ago.is_some_and(|ago| ago < settled)
     })
 }
 
@@ -116,6 +114,13 @@ pub(crate) enum Followed {
 }
 
 impl Bare {
+    /// For how long what is whole has not changed.
+    pub(crate) fn settled(&self) -> Duration {
+        self.drop_after.map_or(ListConfig::DROP_AFTER, |seconds| {
+            Duration::from_secs(seconds.into())
+        })
+    }
+
     /// What to follow in a folder; `name` is the volume's, and `kept` where that was kept which an earlier run found.
     pub(crate) fn followed(
         &self,
@@ -267,9 +272,7 @@ impl Bare {
             scale: self.pixel.unwrap_or(1.0),
             poll: IngestOptions::DEFAULT.poll,
             rest: ListConfig::REST,
-            drop_after: self.drop_after.map_or(ListConfig::DROP_AFTER, |seconds| {
-                Duration::from_secs(seconds.into())
-            }),
+            drop_after: self.settled(),
             budget: WatchConfig::BUDGET,
         };
         let mut info = AcquisitionInfo::new(name, UVec3::ONE, voxel_nm);

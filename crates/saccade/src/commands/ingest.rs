@@ -301,16 +301,18 @@ impl Ingest {
         kept: Option<&Path>,
         cancel: &Cancel,
     ) -> Result<Option<Followed>> {
-        let mut said = false;
+        let (mut said, settled) = (false, self.bare.settled());
         loop {
             let error = match self.bare.followed(&self.acquisition, name, kept) {
                 Ok(followed) => return Ok(Some(followed)),
-                Err(error) if self.once || !is_being_written(&error) => return Err(error),
+                Err(error) if self.once || !is_being_written(&error, settled) => return Err(error),
                 Err(error) => error,
             };
             if !std::mem::replace(&mut said, true) {
                 log::warn!(
-                    "{error:#}; it was written just now, and is read again in case it is not whole yet"
+                    "{error:#}; it was written just now, and is read again in case it is not whole yet, until it has not changed \
+                     for {} s",
+                    settled.as_secs()
                 );
             }
             tokio::select! {
@@ -352,6 +354,7 @@ impl Ingest {
         };
         let mut options = IngestOptions {
             volume: self.volume.clone(),
+            folder: location.folder().map(Path::to_owned),
             encoding: self.stored.encoding(),
             once: self.once,
             workers: self

@@ -268,13 +268,34 @@ fn a_list_that_is_being_written_at_the_start_is_waited_for() {
     assert!(said.contains(text(&list)), "{said}");
     std::fs::write(&list, &specs).unwrap();
     says(&following.stderr, "the places are those of");
+    drop(following);
+
+    // Who writes it may pause: it is waited for as long as what looks like half of one is elsewhere.
+    let written = |ago: u64| {
+        std::fs::write(&list, &specs[..70]).unwrap();
+        let file = std::fs::File::options().write(true).open(&list).unwrap();
+        let at = std::time::SystemTime::now() - Duration::from_secs(ago);
+        file.set_modified(at).unwrap();
+    };
+    let fresh = folder.path().join("fresh");
+    let ingest_anew = ["ingest", text(&scope), text(&fresh), "--voxel", "4"];
+    let ingest_anew = [&ingest_anew[..], &["--list", text(&list)]].concat();
+    written(8);
+    let following = Program::start_with(&ingest_anew, &[]);
+    says(&following.stderr, "until it has not changed for 30 s");
+    std::fs::write(&list, &specs).unwrap();
+    says(&following.stderr, "the places are those of");
+    drop(following);
+    let _what_it_had_made = std::fs::remove_dir_all(&fresh);
+    written(8);
+    let hasty = [&ingest_anew[..], &["--drop-after", "5"]].concat();
+    assert_failed(&run(hasty), 1, &["list.json"]);
 
     // What rests makes no sense to anybody.
     std::fs::write(&list, &specs[..70]).unwrap();
     let long_ago = std::time::SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
     let file = std::fs::File::options().write(true).open(&list).unwrap();
     file.set_modified(long_ago).unwrap();
-    drop(following);
     let _what_it_had_made = std::fs::remove_dir_all(&archive);
     assert_failed(&run(ingest), 1, &["list.json"]);
 }
@@ -325,6 +346,17 @@ fn a_project_of_some_of_the_tiles_is_told() {
         !said.contains("is not used") && said.contains("3 moved"),
         "{said}"
     );
+    // Which file's places count is told then, and whenever it begins.
+    for said in [said, stderr(&done(ingest))] {
+        let told = said
+            .lines()
+            .filter(|line| line.contains("registration has put them"));
+        let told: Vec<_> = told.collect();
+        assert!(
+            matches!(told[..], [line] if line.ends_with("project.xml")),
+            "{said}"
+        );
+    }
 }
 
 /// A replay does not wait for whoever could say which one is meant.
@@ -533,4 +565,45 @@ fn a_list_that_grows_is_followed() {
     let told = Command::new("kill").args(["-TERM", &id]).status();
     assert!(told.unwrap().success());
     assert!(following.0.wait().unwrap().success());
+}
+
+/// How large it is cannot be mended later.
+#[test]
+fn a_size_that_a_growing_list_decides_is_told_with_the_way_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    for name in ["a.png", "b.png"] {
+        picture(&scope, name, 10);
+    }
+    let list = scope.join("list.txt");
+    std::fs::write(&list, "a.png 0 0 0\n").unwrap();
+    let ingest = ["ingest", text(&scope), text(&archive), "--once"];
+    let ingest = [&ingest[..], &["--voxel", "4"]].concat();
+    let said = stderr(&done(&ingest));
+    for words in [
+        "the 1 tiles that are listed so far decide",
+        "40 x 30 x 1 voxels",
+        "--volume NAME",
+        "--extent and --origin",
+    ] {
+        assert_eq!(said.matches(words).count(), 1, "{said}");
+    }
+    std::fs::write(&list, "a.png 0 0 0\nb.png 0 0 1\n").unwrap();
+    let grown = run(&ingest);
+    ended(
+        &grown,
+        3,
+        &["wholly outside", "--volume NAME", "--extent", "--origin"],
+    );
+    assert!(!stderr(&grown).contains("so far decide"), "it is known");
+
+    let out = [
+        "--volume", "other", "--extent", "90,90,9", "--origin", "0,0",
+    ];
+    let said = stderr(&done([&ingest[..], &out].concat()));
+    assert!(
+        said.contains("2 tiles taken in") && !said.contains("so far decide"),
+        "{said}"
+    );
 }

@@ -14,16 +14,24 @@ use crate::held_up::HeldUp;
 /// # Errors
 ///
 /// [`ListError`]: but a list or folder that cannot be read is waited for, with `once` for some looks, and a full disk is
-/// waited out. A list that cannot be read from the beginning is an error.
+/// waited out. A list that cannot be read from the beginning is an error, unless it may still be written.
 pub fn follow<F: Folders>(
     watch: &mut ListWatch<F>,
     until: Until,
     once: bool,
     cancel: &Cancel,
 ) -> Result<u64, ListError> {
+    watch.once = once;
     look_on(watch, once, cancel, |watch| {
         until == Until::Known && watch.is_known()
     })
+}
+
+impl<F: Folders> ListWatch<F> {
+    /// Whether somebody may still be writing the list: it changed a moment ago, and is not said to be all there.
+    pub(super) fn may_grow(&self) -> bool {
+        !self.once && self.files.age(self.disk.now()) < self.config.drop_after
+    }
 }
 
 /// Until when a list is followed.
@@ -50,6 +58,8 @@ impl<F: Folders> Looks for ListWatch<F> {
 
     fn passes(&self, error: &ListError) -> Passes {
         match error {
+            // Half of a first one may be about to become whole.
+            ListError::List { .. } if !self.is_known() && self.may_grow() => Passes::Soon,
             ListError::List { .. } | ListError::Gone { .. } if !self.is_known() => Passes::Never,
             error => error.passes(),
         }
@@ -58,7 +68,7 @@ impl<F: Folders> Looks for ListWatch<F> {
     fn waits_for(&self) -> Option<String> {
         let unclear = self.unclear_said.as_ref().map(|(_, said)| said);
         let said = [
-            self.dropping.as_ref(),
+            self.unsure.as_ref(),
             self.missing_said.as_ref().or(unclear),
             self.unfit.as_ref().filter(|_| self.missing_said.is_none()),
         ];

@@ -158,6 +158,11 @@ impl Frame {
         self.origin += by / self.scale;
     }
 
+    /// Size of the volume \[voxels\].
+    pub(super) fn extent(&self) -> UVec3 {
+        self.info.extent
+    }
+
     /// Whether the volume has channels with names.
     pub(super) fn has_channels(&self) -> bool {
         !self.info.channels.is_empty()

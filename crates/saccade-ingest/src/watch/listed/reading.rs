@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use glam::{DVec2, UVec2};
+use glam::{DVec2, UVec2, UVec3};
 use saccade_archive::acquisition::{
     AcquisitionError, ChannelRef, DeleteRecord, Record, TransformRecord,
 };
@@ -30,20 +30,20 @@ impl<F: Folders> ListWatch<F> {
                 return Err(ListError::Gone { path });
             }
             State::Same => {
-                self.dropping = None;
+                self.unsure = None;
                 return self.troubled();
             }
             State::Changed(age) if age < self.config.rest => {
-                self.dropping = None;
+                self.unsure = None;
                 return Ok(true);
             }
             // Nothing but time will tell whether it is whole.
-            State::Changed(age) if self.dropping.is_some() && age < self.config.drop_after => {
+            State::Changed(age) if self.unsure.is_some() && age < self.config.drop_after => {
                 return Ok(true);
             }
             State::Changed(age) => age,
         };
-        (self.trouble, self.dropping) = (None, None);
+        (self.trouble, self.unsure) = (None, None);
         // One that was begun without channels goes on so.
         let channels = self.frame.as_ref().is_none_or(Frame::has_channels);
         let mut listing = match source::read(&self.config, channels) {
@@ -55,6 +55,17 @@ impl<F: Folders> ListWatch<F> {
             Ok(listing) => listing,
             Err(e) => return self.unreadable(e),
         };
+        if let Some(line) = listing.cut_at.filter(|_| self.may_grow()) {
+            let said = format!(
+                "line {line} ends the list without a line feed, and may be cut within a number; the list is read once a line \
+                 feed is there, or it has not changed for {} s: {}",
+                self.config.drop_after.as_secs_f64(),
+                self.config.list.display()
+            );
+            log::warn!("{said}");
+            self.unsure = Some(said);
+            return Ok(true);
+        }
         listing.check_fit(&self.config)?;
         if self.frame.is_none() {
             listing.check_channels(&self.config)?;
@@ -80,7 +91,7 @@ impl<F: Folders> ListWatch<F> {
                     self.config.list.display()
                 );
                 log::warn!("{said}");
-                self.dropping = Some(said);
+                self.unsure = Some(said);
                 return Ok(true);
             }
         }
@@ -96,6 +107,15 @@ impl<F: Folders> ListWatch<F> {
             let (frame, adopted) = begun?;
             frame.keep(&self.folder, &self.kept)?;
             frame::keep_adopted(adopted.as_ref(), &self.folder, &self.kept)?;
+            if self.config.extent.is_none() && age < self.config.drop_after {
+                let (UVec3 { x, y, z }, tiles) = (frame.extent(), listing.tiles.len());
+                log::warn!(
+                    "the {tiles} tiles that are listed so far decide that the volume has {x} x {y} x {z} voxels, and the list \
+                     changed a moment ago: if it still grows, begin under another name (--volume NAME) with --extent and \
+                     --origin: {}",
+                    self.config.list.display()
+                );
+            }
             (self.frame, self.adopted) = (Some(frame), adopted);
         } else if let Some(adopted) = &mut self.adopted {
             match solution_again(&adopted.solution.path, listing.own.as_ref()) {
@@ -111,8 +131,6 @@ impl<F: Folders> ListWatch<F> {
             match adopt(&listing, &projects, self.raw(&listing)) {
                 Ok(None) => {}
                 Ok(Some(adopted)) => {
-                    let path = adopted.solution.path.display();
-                    log::info!("tiles lie where registration has put them from now on: {path}");
                     frame::keep_adopted(Some(&adopted), &self.folder, &self.kept)?;
                     self.adopted = Some(adopted);
                 }
@@ -122,6 +140,7 @@ impl<F: Folders> ListWatch<F> {
         if let Some(counted) = counted {
             self.keep_counted(&listing, counted)?;
         }
+        self.say_registration();
         self.say_shift();
         self.say_unsolved(&listing, &projects);
         self.files.are_read();
@@ -174,6 +193,21 @@ impl<F: Folders> ListWatch<F> {
             frame::keep_adopted(self.adopted.as_ref(), &self.folder, &self.kept)?;
         }
         Ok(())
+    }
+
+    /// Says which file's places count, if they are not the list's, once, and when that changes.
+    fn say_registration(&mut self) {
+        let adopted = self.adopted.as_ref();
+        let path = adopted.map(|adopted| &adopted.solution.path);
+        // What the list itself says of registration is no other file.
+        let path = path.filter(|path| **path != self.config.list);
+        if let Some(path) = path.filter(|path| self.registration_said.as_ref() != Some(path)) {
+            log::warn!(
+                "the tiles lie where registration has put them, not where the list says: {}",
+                path.display()
+            );
+            self.registration_said = Some(path.clone());
+        }
     }
 
     /// Says how far registration's places are moved, once, and when that changes.

@@ -55,6 +55,8 @@ pub(super) struct Listing {
     pub(super) unfit: Option<Unfit>,
     /// What of it does not count, or otherwise than it is written, in words.
     pub(super) notes: Vec<String>,
+    /// The last line, if the list ends in a number of which more may be about to be written.
+    pub(super) cut_at: Option<u64>,
 }
 
 impl Listing {
@@ -106,6 +108,7 @@ pub(super) fn read(config: &ListConfig, channels: bool) -> Result<Listing, Acqui
             counts: None,
             unfit: None,
             notes: Vec::from_iter(note),
+            cut_at: None,
         }
     } else {
         let list = lists::read(path)?;
@@ -127,6 +130,7 @@ pub(super) fn read(config: &ListConfig, channels: bool) -> Result<Listing, Acqui
             counts: list.stage,
             unfit: None,
             notes: list.notes,
+            cut_at: list.cut_at,
         }
     };
     listing.tiles.sort_by_key(|tile| tile.section);
@@ -366,7 +370,12 @@ impl Files {
         if self.read.as_ref() == Some(&self.now.0) {
             return State::Same;
         }
-        State::Changed(now.duration_since(self.now.1).unwrap_or_default())
+        State::Changed(self.age(now))
+    }
+
+    /// For how long they look as they do.
+    pub(super) fn age(&self, now: SystemTime) -> Duration {
+        now.duration_since(self.now.1).unwrap_or_default()
     }
 
     /// They are read as they looked last.
