@@ -101,10 +101,11 @@ impl Check<'_> {
                 }
                 _ => false,
             };
-            if match is_its {
+            let is_its = match is_its {
                 Some(is_its) => is_its,
                 None => is_known().await,
-            } {
+            };
+            if is_its {
                 owners.insert(name.clone());
             }
         }
