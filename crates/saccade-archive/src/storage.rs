@@ -17,10 +17,10 @@ mod memory;
 mod name;
 mod object;
 
-pub(crate) use disk::{open_regular, read_regular};
 pub use disk::{
     Crash, DirEntry, Disk, FolderId, Metadata, OpenFile, SimulatedDisk, SystemDisk, write_whole,
 };
+pub(crate) use disk::{open_regular, read_regular};
 pub use error::StorageError;
 pub use faulty::{FaultyStorage, ReadFault, WriteFault};
 pub use local::LocalStorage;

@@ -57,8 +57,8 @@ mod web;
 pub use acquisition::AcquisitionReader;
 pub use detail::details_from_text;
 pub use options::{
-    AskedWith, BackgroundError, OptionsError, ViewOptions, background_from_text, gpu_memory_from_text,
-    host_memory_from_text,
+    AskedWith, BackgroundError, OptionsError, ViewOptions, background_from_text,
+    gpu_memory_from_text, host_memory_from_text,
 };
 pub use page::{PageError, PageOptions};
 pub use plane::{Plane, plane_from_text, slice_from_text};
