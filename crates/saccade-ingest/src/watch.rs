@@ -176,6 +176,25 @@ pub(crate) const BEFORE_FIRST: u32 = u32::MAX;
 /// Name of the link to the watched folder.
 const LINK: &str = "files";
 
+/// Makes the link to the folder that is watched; whether it led elsewhere. Of several that do so at once all succeed.
+fn link(folder: &Path, kept: &Path) -> Result<bool, WatchError> {
+    let link = kept.join(LINK);
+    let linked = fs::read_link(&link).ok();
+    if linked.as_deref() == Some(folder) {
+        return Ok(false);
+    }
+    let old = match &linked {
+        Some(_) => fs::remove_file(&link),
+        None => Ok(()),
+    };
+    match old.and_then(|()| std::os::unix::fs::symlink(folder, &link)) {
+        // Another that began at the same time was faster.
+        Err(_) if fs::read_link(&link).is_ok_and(|now| now == folder) => {}
+        made => made.map_err(|source| WatchError::Write { source, path: link })?,
+    }
+    Ok(linked.is_some())
+}
+
 /// The path in the watched folder of a file that a record names: without the link, of which people know nothing.
 pub fn file_name(file: &str) -> &str {
     let inside = file.strip_prefix(LINK);
@@ -221,9 +240,8 @@ impl<F: Folders> Watch<F> {
             path: folder.to_owned(),
         };
         let folder = folder.canonicalize().map_err(look)?;
-        let link = kept.join(LINK);
         let info = AcquisitionInfo::read(kept).ok();
-        let linked = fs::read_link(&link).ok();
+        let linked = fs::read_link(kept.join(LINK)).ok();
         let pitch = config.pitch.to_array();
         let pattern = config.pattern.to_string();
         let now = Settings::of_watch(&pattern, pitch, config.scale, config.first);
@@ -249,21 +267,13 @@ impl<F: Folders> Watch<F> {
         if info.as_ref() != Some(&config.info) {
             config.info.write(kept)?;
         }
-        if linked.as_ref() != Some(&folder) {
-            let old = if linked.is_some() {
-                fs::remove_file(&link)
-            } else {
-                Ok(())
-            };
-            old.and_then(|()| std::os::unix::fs::symlink(&folder, &link))
-                .map_err(|source| WatchError::Write { source, path: link })?;
-        }
+        let led_elsewhere = link(&folder, kept)?;
         // Those of earlier versions did not keep them.
         if settings.as_ref() != Some(&now) {
             now.write_to(kept.join(SETTINGS))?;
         }
         let stamps = Stamps::new(kept);
-        if linked.is_some_and(|linked| linked != folder) {
+        if led_elsewhere {
             // Copies are other files.
             stamps.forget();
         }

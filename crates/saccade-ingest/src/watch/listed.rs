@@ -41,7 +41,7 @@ use super::again::Again;
 use super::list::List;
 use super::stamp::{Seen, Stamp};
 use super::stamps::Stamps;
-use super::{Folders, Next, Untold, WatchError};
+use super::{Folders, Next, Untold, WatchError, link};
 use crate::held_up::HeldUp;
 use frame::Frame;
 use index::{Index, Sought, base, key};
@@ -194,7 +194,7 @@ impl<F: Folders> ListWatch<F> {
         })?;
         let stamps = Stamps::new(kept);
         let frame = Frame::open(&config, &folder, kept)?;
-        if frame::link(&folder, kept)? {
+        if link(&folder, kept)? {
             // Copies are other files.
             stamps.forget();
         }

@@ -527,3 +527,24 @@ fn a_folder_that_is_away_is_waited_for() {
         }
     }
 }
+
+/// Workers that are started together.
+#[test]
+fn of_several_that_link_a_folder_at_once_all_succeed() {
+    let folder = tempfile::tempdir().unwrap();
+    let watched = folder.path().canonicalize().unwrap();
+    let turns = std::sync::Barrier::new(4);
+    for turn in 0..50 {
+        let kept = folder.path().join(turn.to_string());
+        fs::create_dir(&kept).unwrap();
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    turns.wait();
+                    assert!(!link(&watched, &kept).unwrap());
+                });
+            }
+        });
+        assert_eq!(fs::read_link(kept.join(LINK)).unwrap(), watched);
+    }
+}

@@ -305,7 +305,7 @@ async fn what_is_said_of_an_image_is_of_the_folder_that_people_know() {
             .unwrap_or_else(|| panic!("{file}: {set_aside:?}"))
             .reason
     };
-    let gone = gone.to_str().unwrap();
+    let (scope, gone) = (bare.scope(), "the acquisition's folder/s0/r1_c1.tif");
     for (file, parts) in [
         ("s0/r0_c0.tif", &["rename it over this file"][..]),
         ("s0/r0_c1.tif", &["colour"]),
@@ -321,14 +321,18 @@ async fn what_is_said_of_an_image_is_of_the_folder_that_people_know() {
     let notices = diary.notices();
     assert!(notices.iter().any(|n| n.starts_with(waited)), "{notices:?}");
     let kept = bare.kept();
+    let reasons = || set_aside.iter().map(|one| &one.reason);
     for word in ["files/", "record", "volume.json", kept.to_str().unwrap()] {
-        for told in notices
-            .iter()
-            .chain(set_aside.iter().map(|one| &one.reason))
-        {
+        for told in notices.iter().chain(reasons()) {
             assert!(!told.contains(word), "{word:?} is in: {told}");
         }
     }
+    // Those who look from elsewhere are told the reasons.
+    let machines = scope.to_str().unwrap();
+    assert!(
+        reasons().all(|told| !told.contains(machines)),
+        "{set_aside:?}"
+    );
     // As it was told to.
     put(&mut bare, 0, &whole);
     assert_eq!(ingest(&bare, false).await.tiles, 1);

@@ -58,22 +58,6 @@ pub fn kept_list(folder: &Path, kept: &Path) -> Option<PathBuf> {
     settings.text("list").map(|list| folder.join(list))
 }
 
-/// Makes the link to the folder; whether it led elsewhere.
-pub(super) fn link(folder: &Path, kept: &Path) -> Result<bool, WatchError> {
-    let link = kept.join(LINK);
-    let linked = fs::read_link(&link).ok();
-    if linked.as_deref() == Some(folder) {
-        return Ok(false);
-    }
-    let old = match &linked {
-        Some(_) => fs::remove_file(&link),
-        None => Ok(()),
-    };
-    old.and_then(|()| std::os::unix::fs::symlink(folder, &link))
-        .map_err(|source| WatchError::Write { source, path: link })?;
-    Ok(linked.is_some())
-}
-
 impl Frame {
     /// What is kept, if it is what is asked for, or nothing yet.
     pub(super) fn open(
