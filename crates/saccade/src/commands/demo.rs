@@ -151,6 +151,7 @@ impl Demo {
         let shown = Shown::new("demo", Some(total.saturating_sub(before)));
         let working = async {
             let following = IngestOptions {
+                folder: Some(work.archive()),
                 encoding: self.stored.encoding(),
                 ..Default::default()
             };

@@ -91,8 +91,11 @@ pub(crate) struct Bare {
 pub(crate) fn is_being_written(error: &anyhow::Error, settled: Duration) -> bool {
     let files = error.chain().filter_map(|cause| {
         let shared = cause.downcast_ref::<Arc<AcquisitionError>>();
-        let found = { cause.downcast_ref() }.or(shared.map(AsRef::as_ref))?;
-        Some(AcquisitionError::path(found).to_owned())
+        match { cause.downcast_ref() }.or(shared.map(AsRef::as_ref))? {
+            // Nothing that is written to a link's end makes it stay inside.
+            AcquisitionError::LeadsOut { .. } => None,
+            found => Some(found.path().to_owned()),
+        }
     });
     let mut files = files.filter_map(|path| path.metadata().ok().filter(Metadata::is_file));
     files.any(|file| {

@@ -300,6 +300,22 @@ fn a_list_that_is_being_written_at_the_start_is_waited_for() {
     assert_failed(&run(ingest), 1, &["list.json"]);
 }
 
+/// What it leads to may be whole or not.
+#[cfg(unix)]
+#[test]
+fn a_link_that_leads_out_is_refused_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive, other] =
+        ["scope", "archive", "other.json"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    std::fs::write(&other, "{}").unwrap();
+    std::os::unix::fs::symlink(&other, scope.join("volume.json")).unwrap();
+    let refused = run(["ingest", text(&scope), text(&archive)]);
+    assert_failed(&refused, 1, &["leads out", "volume.json"]);
+    let said = stderr(&refused);
+    assert!(!said.contains("is read again"), "{said}");
+}
+
 /// It may be about others of such names, or be saved too early.
 #[test]
 fn a_project_of_some_of_the_tiles_is_told() {
