@@ -44,6 +44,7 @@ pub mod catalog;
 pub mod check;
 pub mod clock;
 pub mod image;
+mod percent;
 pub mod pyramid;
 pub mod randomness;
 pub mod storage;

@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use glam::DVec2;
 
 use super::AcquisitionError;
+use super::image_path;
 use super::text::{content, quoted};
+use crate::percent;
 use crate::storage::read_regular;
 
 /// A line of a tile list.
@@ -32,9 +34,25 @@ impl ListedTile {
     }
 }
 
-/// File name without folder and extension; either slash separates folders.
+/// File name without folder; either slash separates folders, for lists are written on any system.
+pub fn base(file: &str) -> &str {
+    file.rsplit(['/', '\\']).next().unwrap_or(file)
+}
+
+/// What a listed file means if it is written as part of a URL; `None` if it cannot be, or means itself.
+///
+/// Whether it is written so, only the files tell that are there. No folder is reached but those that its slashes separate:
+/// an encoded one is none of them.
+pub fn decoded(file: &str) -> Option<String> {
+    let slashes = |text: &str| text.matches(['/', '\\']).count();
+    let decoded = percent::decoded(file)?;
+    let is_file = !decoded.contains('\0') && slashes(&decoded) == slashes(file);
+    (is_file && decoded != file).then_some(decoded)
+}
+
+/// File name without folder and extension.
 pub fn stem(file: &str) -> &str {
-    let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
+    let name = base(file);
     name.rsplit_once('.')
         .map_or(name, |(stem, _)| if stem.is_empty() { name } else { stem })
 }
@@ -193,17 +211,46 @@ impl Images {
     /// The image that [`Self::find`] takes for `file`, and another that may be meant as well, since several have its name and
     /// none lies at that path.
     pub fn several(&self, file: &str) -> Option<[&Path; 2]> {
-        let as_named = super::image_path(&self.folder, file).is_some_and(|path| path.is_file());
-        let name = file.rsplit(['/', '\\']).next().filter(|_| !as_named)?;
-        Some([self.by_name.get(name)?, self.others.get(name)?])
+        match self.found(file)? {
+            Found::AtPath(_) => None,
+            Found::ByName(name, path) => Some([path, self.others.get(name)?]),
+        }
     }
 
-    /// The image that a list calls `file`: at that path below the folder, else by name alone.
+    /// The image that a list calls `file`: at that path below the folder, else by name alone; if there is none, the same of
+    /// what it means [`decoded`].
     pub fn find(&self, file: &str) -> Option<PathBuf> {
-        let as_named = super::image_path(&self.folder, file).filter(|p| p.is_file());
-        let name = file.rsplit(['/', '\\']).next()?;
-        as_named.or_else(|| self.by_name.get(name).cloned())
+        Some(match self.found(file)? {
+            Found::AtPath(path) => path,
+            Found::ByName(_, path) => path.to_owned(),
+        })
     }
+
+    fn found(&self, file: &str) -> Option<Found<'_>> {
+        let at_path = |file: &str| {
+            let path = image_path(&self.folder, file)?;
+            path.is_file().then_some(Found::AtPath(path))
+        };
+        let by_name = |file: &str| {
+            let (name, path) = self.by_name.get_key_value(base(file))?;
+            Some(Found::ByName(name, path))
+        };
+        let decoded = decoded(file);
+        let decoded = decoded.as_deref();
+        // Where only folders are encoded, no file has another name.
+        let same_name = decoded.filter(|decoded| base(decoded) == base(file));
+        at_path(file)
+            .or_else(|| at_path(same_name?))
+            .or_else(|| by_name(file))
+            .or_else(|| at_path(decoded?))
+            .or_else(|| by_name(decoded?))
+    }
+}
+
+/// How an image was found.
+enum Found<'a> {
+    AtPath(PathBuf),
+    ByName(&'a str, &'a Path),
 }
 
 #[cfg(test)]
@@ -304,6 +351,68 @@ mod tests {
         assert!(taken.ends_with("deep/er/a.tif") && other.ends_with("other/a.tif"));
         for clear in ["other/a.tif", "b.tif", "none.tif"] {
             assert_eq!(images.several(clear), None, "{clear}");
+        }
+    }
+
+    #[test]
+    fn names_of_urls_are_found_decoded_where_no_file_has_them_as_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::create_dir_all(folder.path().join("in/a b")).unwrap();
+        fs::create_dir_all(folder.path().join("other")).unwrap();
+        let files = [
+            "in/t#1.tif",
+            "in/ü.tif",
+            "in/both 1.tif",
+            "other/both%201.tif",
+            "in/50%.tif",
+            "in/100%2525.tif",
+            "in/a b/same.tif",
+            "in/same.tif",
+            "x.tif",
+        ];
+        for file in files {
+            fs::write(folder.path().join(file), "").unwrap();
+        }
+        // What lies beside the folder is out of reach.
+        let inner = folder.path().join("in");
+        let all = Images::below(folder.path()).unwrap();
+        let inside = Images::below(&inner).unwrap();
+        let found = |images: &Images, file| {
+            let path = images.find(file)?;
+            Some(path.strip_prefix(folder.path()).unwrap().to_owned())
+        };
+        for (listed, there) in [
+            ("/scope/a%20b/t%231.tif", "in/t#1.tif"),
+            ("in/t%231.tif", "in/t#1.tif"),
+            ("/scope/%C3%BC.tif", "in/ü.tif"),
+            ("/scope/50%25.tif", "in/50%.tif"),
+            // As it is, also elsewhere, before what it means.
+            ("in/both%201.tif", "other/both%201.tif"),
+            ("/scope/100%2525.tif", "in/100%2525.tif"),
+            // Where only the folder is encoded, it tells which one is meant.
+            ("in/a%20b/same.tif", "in/a b/same.tif"),
+        ] {
+            assert_eq!(
+                found(&all, listed).as_deref(),
+                Some(Path::new(there)),
+                "{listed}"
+            );
+        }
+        assert_eq!(all.several("in/a%20b/same.tif"), None);
+        assert!(all.several("/scope/s%61me.tif").is_some());
+        for nothing in [
+            "%2e%2e%2fx.tif",
+            "%2E%2E/x.tif",
+            "a%20b%2Fsame.tif",
+            "..%5cx.tif",
+            "%2e%2e",
+            "%2e",
+            "x%00.tif",
+            "%ff.tif",
+            "t%2.tif",
+            "t%zz1.tif",
+        ] {
+            assert_eq!(found(&inside, nothing), None, "{nothing}");
         }
     }
 }

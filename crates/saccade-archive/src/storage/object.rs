@@ -16,6 +16,7 @@ use object_store::{
 
 use super::{Entry, Storage, StorageError, check_name};
 use crate::clock::{Clock as _, SystemClock};
+use crate::percent;
 
 mod location;
 mod sort;
@@ -177,7 +178,7 @@ impl ObjectStorage {
     fn name(&self, path: &Path) -> Option<String> {
         let parts: Vec<_> = path.prefix_match(&self.prefix)?.collect();
         let parts: Vec<&str> = parts.iter().map(AsRef::as_ref).collect();
-        location::decoded(&parts.join("/"))
+        percent::decoded(&parts.join("/"))
     }
 
     fn failed(&self, error: object_store::Error, name: &str) -> StorageError {

@@ -44,7 +44,7 @@ use super::stamps::Stamps;
 use super::{Folders, Next, Untold, WatchError, link};
 use crate::held_up::HeldUp;
 use frame::Frame;
-use index::{Index, Sought, base, key};
+use index::{Index, Sought, base, key, names};
 use source::{Adopted, Files};
 
 mod channels;
@@ -275,7 +275,7 @@ impl<F: Folders> ListWatch<F> {
                 continue;
             };
             let file = &wanted.file;
-            let there = odd.get(base(file)).copied();
+            let there = names(file).find_map(|name| odd.get(&*name).copied());
             let Some(path) = there.or_else(|| self.index.folder(file)) else {
                 absent += 1;
                 first_absent = first_absent.or(Some(file));

@@ -1,6 +1,7 @@
 //! Folders whose tiles a list names: every kind of list, lists that change, and processes that are killed meanwhile.
 
 mod channels;
+mod encoded;
 mod growing;
 mod power_cuts;
 mod refused;

@@ -74,23 +74,6 @@ impl fmt::Display for BucketLocation {
     }
 }
 
-/// Undoes percent-encoding; `None` for what cannot have been encoded.
-pub(super) fn decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.as_bytes();
-    while let Some((&byte, after)) = rest.split_first() {
-        rest = after;
-        if byte != b'%' {
-            bytes.push(byte);
-            continue;
-        }
-        let (digits, after) = rest.split_at_checked(2)?;
-        rest = after;
-        bytes.push(u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?);
-    }
-    String::from_utf8(bytes).ok()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -125,14 +108,5 @@ mod tests {
             assert!(error.contains("s3://bucket"), "{error}");
         }
         assert!(BucketLocation::is_meant_by("s3:b") && !BucketLocation::is_meant_by("s3/b"));
-    }
-
-    #[test]
-    fn names_are_decoded() {
-        assert_eq!(decoded("a/%7Eb%25c").as_deref(), Some("a/~b%c"));
-        assert_eq!(decoded("a%C3%84").as_deref(), Some("aÄ"));
-        for bad in ["%", "a%4", "%zz", "%ff"] {
-            assert_eq!(decoded(bad), None, "{bad}");
-        }
     }
 }

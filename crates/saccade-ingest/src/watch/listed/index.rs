@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use saccade_archive::acquisition::image_path;
+pub(super) use saccade_archive::acquisition::tile_list::base;
+use saccade_archive::acquisition::tile_list::decoded;
 
 use super::super::{Entry, Folders, Next};
 
@@ -92,9 +94,12 @@ fn likeness(path: &Path, file: &str) -> usize {
         .count()
 }
 
-/// A path's last part; lists are written by programs that separate folders by either slash.
-pub(super) fn base(file: &str) -> &str {
-    file.rsplit(['/', '\\']).next().unwrap_or(file)
+/// The names that the image may have which a list calls `file`: as it is written, and as it is meant if that is part of a
+/// URL.
+pub(super) fn names(file: &str) -> impl Iterator<Item = String> {
+    let meant = decoded(file).map(|decoded| base(&decoded).to_owned());
+    let meant = meant.filter(|name| name != base(file));
+    [base(file).to_owned()].into_iter().chain(meant)
 }
 
 impl Index {
@@ -130,8 +135,26 @@ impl Index {
     }
 
     /// The image that a list calls `file`: at that path, else by name alone. Of several of that name the one whose
-    /// folders are most like those that the list names; none, if that could be several.
+    /// folders are most like those that the list names; none, if that could be several. If there is none, the same of what
+    /// `file` means [`decoded`].
     pub(super) fn sought(&self, file: &str) -> Sought {
+        let as_written = self.sought_as(file);
+        let Some(decoded) = decoded(file) else {
+            return as_written;
+        };
+        match as_written {
+            Sought::There(_) => as_written,
+            Sought::Missing => self.sought_as(&decoded),
+            // Where only folders are encoded, they may tell which one is meant.
+            Sought::Several(_) if base(&decoded) == base(file) => match self.sought_as(&decoded) {
+                there @ Sought::There(_) => there,
+                Sought::Several(_) | Sought::Missing => as_written,
+            },
+            Sought::Several(_) => as_written,
+        }
+    }
+
+    fn sought_as(&self, file: &str) -> Sought {
         let there = |path: &Path| match path.to_str() {
             Some(path) => Sought::There(path.to_owned()),
             None => Sought::Missing,
@@ -164,31 +187,49 @@ impl Index {
     /// The same; what is not where it was is looked for anew.
     pub(super) fn find(&mut self, file: &str) -> Sought {
         let found = self.sought(file);
-        let (name, hash) = (base(file), key(base(file)));
-        if found == Sought::Missing
-            && let Some(folder) = self.files.remove(&hash)
-        {
-            // It is gone, or nothing to read; another of its name may be there.
-            self.several.remove(&hash);
-            let path = self.folders[folder].path.join(name);
-            if oddity(&self.root.join(&path)).is_some() {
-                self.odd.insert(path);
-            }
-            for folder in &mut self.folders {
-                folder.listed = None;
+        if found == Sought::Missing {
+            for name in names(file) {
+                self.forget(&name);
             }
         }
         found
     }
 
+    /// What had that name is gone, or nothing to read; another of its name may be there.
+    fn forget(&mut self, name: &str) {
+        let hash = key(name);
+        let Some(folder) = self.files.remove(&hash) else {
+            return;
+        };
+        self.several.remove(&hash);
+        let path = self.folders[folder].path.join(name);
+        if oddity(&self.root.join(&path)).is_some() {
+            self.odd.insert(path);
+        }
+        for folder in &mut self.folders {
+            folder.listed = None;
+        }
+    }
+
     /// Whether the image that was found is the one that a list calls `file`: as long as it has that name, and there is
-    /// none at that path.
+    /// none at that path; or the name that is meant, and there is none of the one that is written.
     pub(super) fn is_still(&self, found: &str, file: &str) -> bool {
-        let named =
-            image_path(Path::new(""), file).map(|path| path.components().collect::<PathBuf>());
-        base(found) == base(file)
-            && named
-                .is_none_or(|named| named == Path::new(found) || !self.root.join(named).is_file())
+        let another_at = |file: &str| {
+            let named = image_path(Path::new(""), file);
+            let named = named.map(|path| path.components().collect::<PathBuf>());
+            named.is_some_and(|named| named != Path::new(found) && self.root.join(named).is_file())
+        };
+        let is_called = |file: &str| base(found) == base(file) && !another_at(file);
+        match decoded(file) {
+            Some(meant) if base(&meant) != base(file) => {
+                let as_meant = || is_called(&meant) && self.sought_as(file) == Sought::Missing;
+                is_called(file) || as_meant()
+            }
+            Some(meant) if another_at(&meant) => {
+                self.sought(file) == Sought::There(found.to_owned())
+            }
+            Some(_) | None => is_called(file),
+        }
     }
 
     /// What was looked for and is nothing to read, by its name.
@@ -205,10 +246,12 @@ impl Index {
 
     /// The folder that a list calls `file`, as if it were an image.
     pub(super) fn folder(&self, file: &str) -> Option<&Path> {
-        let (path, _) = self
-            .paths
-            .get_key_value(&image_path(Path::new(""), file)?)?;
-        Some(path)
+        let folder = |file: &str| {
+            let path = image_path(Path::new(""), file)?;
+            let (path, _) = self.paths.get_key_value(&path)?;
+            Some(path.as_path())
+        };
+        folder(file).or_else(|| folder(&decoded(file)?))
     }
 
     /// Looks again at some of what is nothing to read: links may lead to something later.
@@ -407,5 +450,62 @@ mod tests {
         assert_eq!(index.find("a.tif"), Sought::Missing);
         round(&mut index);
         assert_eq!(index.find("a.tif"), there("new/a.tif"));
+    }
+
+    #[test]
+    fn what_is_meant_by_a_url_is_found_where_nothing_is_called_as_it_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |file: &str| {
+            let path = folder.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        };
+        let mut index = Index::new(folder.path());
+        let round = |index: &mut Index| while index.look(&Disk, 99).unwrap().1 == Next::More {};
+        for file in ["in/t#1.tif", "a b/same.tif", "c d/same.tif", "x.tif"] {
+            write(file);
+        }
+        round(&mut index);
+        let there = |path: &str| Sought::There(path.to_owned());
+        for (listed, path) in [
+            ("/scope/in/t%231.tif", "in/t#1.tif"),
+            ("in/t%231.tif", "in/t#1.tif"),
+            ("/scope/a%20b/same.tif", "a b/same.tif"),
+            ("c%20d/same.tif", "c d/same.tif"),
+            ("a%20b/%73ame.tif", "a b/same.tif"),
+        ] {
+            assert_eq!(index.find(listed), there(path), "{listed}");
+            assert!(index.is_still(path, listed), "{listed}");
+        }
+        for nothing in [
+            "a%20b%2Fsame.tif",
+            "in/t%231%00.tif",
+            "%2e%2e",
+            "..%2fx.tif",
+        ] {
+            assert_eq!(index.find(nothing), Sought::Missing, "{nothing}");
+        }
+        assert!(matches!(index.find("/e/same.tif"), Sought::Several(_)));
+        assert!(!index.is_still("a b/same.tif", "c%20d/same.tif"));
+
+        // One that is called as it is written comes later, and wherever it is.
+        write("far/t%231.tif");
+        round(&mut index);
+        for listed in ["in/t%231.tif", "/scope/in/t%231.tif"] {
+            assert_eq!(index.find(listed), there("far/t%231.tif"));
+            assert!(index.is_still("far/t%231.tif", listed));
+            assert!(!index.is_still("in/t#1.tif", listed));
+        }
+        // What it means is found again when that is gone, and what becomes of either is noticed.
+        fs::remove_file(folder.path().join("far/t%231.tif")).unwrap();
+        assert_eq!(index.find("in/t%231.tif"), there("in/t#1.tif"));
+        fs::rename(
+            folder.path().join("in/t#1.tif"),
+            folder.path().join("t#1.tif"),
+        )
+        .unwrap();
+        assert_eq!(index.find("in/t%231.tif"), Sought::Missing);
+        round(&mut index);
+        assert_eq!(index.find("in/t%231.tif"), there("t#1.tif"));
     }
 }

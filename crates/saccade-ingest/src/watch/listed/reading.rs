@@ -13,7 +13,7 @@ use saccade_core::transform::SectionFromTile;
 
 use super::super::{BEFORE_FIRST, Folders};
 use super::frame::Frame;
-use super::index::{base, key};
+use super::index::{key, names};
 use super::source::{self, Listing, State, adopt, offset, raw, solution_again};
 use super::{Image, ListError, ListWatch, Tile, Trouble, Wanted, frame};
 use crate::replay::RawTile;
@@ -303,9 +303,11 @@ impl<F: Folders> ListWatch<F> {
                 .checked_sub(frame.first)
                 .unwrap_or(BEFORE_FIRST);
             let name: Arc<str> = named.name.into();
-            let names = self.by_name.entry(key(base(&named.file))).or_default();
-            if !names.contains(&name) {
-                names.push(Arc::clone(&name));
+            for image in names(&named.file) {
+                let tiles = self.by_name.entry(key(&image)).or_default();
+                if !tiles.contains(&name) {
+                    tiles.push(Arc::clone(&name));
+                }
             }
             let tile = self.tiles.entry(Arc::clone(&name)).or_default();
             let image = match &mut tile.told {

@@ -17,7 +17,7 @@ use super::{SIZE, Scope, VOXEL, config, write};
 use crate::scope::{VOLUME, archive, pixels, quick, seen, tiff16};
 
 /// Takes a folder in by its list, and by a replay: both show the same. How many tiles there are.
-async fn is_as_replayed(folder: &Path) -> usize {
+pub(super) async fn is_as_replayed(folder: &Path) -> usize {
     let beside = tempfile::tempdir().unwrap();
     let Input::Acquisition(acquisition) = detect(folder).unwrap() else {
         panic!("{} holds no list", folder.display())
@@ -90,7 +90,7 @@ fn project(layers: &[&[(&str, &str)]]) -> String {
     format!("<trakem2>{}</trakem2>", layers.collect::<String>())
 }
 
-fn spec(file: &str, z: u32, stage: [f64; 2], affine: &str) -> String {
+pub(super) fn spec(file: &str, z: u32, stage: [f64; 2], affine: &str) -> String {
     let [x, y] = stage;
     format!(
         r#"{{"tileId": "{file}.{z}", "z": {z}, "width": 60, "height": 50,
