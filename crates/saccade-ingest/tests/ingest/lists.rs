@@ -8,6 +8,7 @@ mod refused;
 mod registration;
 mod replaced;
 mod replayed;
+mod shared;
 mod stage;
 mod twice;
 

@@ -139,17 +139,19 @@ impl<F: Folders> ListWatch<F> {
                 channel: wanted.channel.clone(),
                 file: file.clone(),
             });
+            let was_replaced = stamp.is_some_and(|stamp| self.was_replaced(&file, &stamp));
+            // One that is being written stays known as it was told of first: once it rests, that tells all of its tiles again.
+            let known = self.seen.get(&key(&file)).copied().flatten();
+            let growing = known.filter(|_| was_replaced && self.again.holds(key(&file)));
             let seen = stamp.map(|stamp| {
-                let seen = Seen::of(&stamp);
-                if stamp.is_young(now) && !self.again.holds(key(&file)) {
+                if stamp.is_young(now) {
                     self.again.add(key(&file), &file, now);
                 }
-                (key(&file), seen)
+                (key(&file), growing.unwrap_or(Seen::of(&stamp)))
             });
-            let was_replaced = stamp.is_some_and(|stamp| self.was_replaced(&file, &stamp));
             self.seen.insert(key(&file), seen.map(|(_, seen)| seen));
             self.untold.push_back((Record::Tile(record), seen));
-            if was_replaced {
+            if was_replaced && growing.is_none() {
                 // Nobody else will see it: what the file looks like now is known from here on.
                 self.tell_others_again(&file, &unread.tile, now);
             }
