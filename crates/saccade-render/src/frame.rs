@@ -240,6 +240,15 @@ pub(crate) fn is_far(frame: &FrameUniform) -> bool {
     })
 }
 
+/// Whether the same level of all channels is wanted, wherever.
+pub(crate) fn are_levels_alike(frame: &FrameUniform) -> bool {
+    let channels = &frame.channels[..frame.channel_count as usize];
+    let levels = |of: &ChannelUniform| (of.first_level, of.last_level, of.coarser);
+    channels
+        .windows(2)
+        .all(|pair| levels(&pair[0]) == levels(&pair[1]))
+}
+
 /// The shader's name of a mode.
 pub(crate) fn mode_of(mode: Mode) -> u32 {
     match mode {

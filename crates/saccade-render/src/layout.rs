@@ -206,6 +206,8 @@ pub(crate) struct Variant {
     pub(crate) false_colors: u32,
     /// Whether samples are kept within their bricks: numbers alone do not where voxels are too far away for f32.
     pub(crate) bounded: bool,
+    /// Whether the same level of all channels is wanted everywhere.
+    pub(crate) levels_alike: bool,
 }
 
 impl Variant {
@@ -225,6 +227,15 @@ impl Variant {
             false_colors,
             // What lies around a surface is sampled as well, up to a voxel further.
             bounded: far || mode == MODE_ISO_SURFACE,
+            levels_alike: true,
+        }
+    }
+
+    /// The same for channels of which different levels are wanted, unless `alike`. One is like itself.
+    pub(crate) fn with_levels(self, alike: bool) -> Self {
+        Self {
+            levels_alike: alike || self.slots == 1,
+            ..self
         }
     }
 }
@@ -233,29 +244,33 @@ impl Variant {
     /// Whether it draws what another does.
     pub(crate) fn stands_in_for(self, other: Self) -> bool {
         let alike = |v: Self| (v.mode, v.joined, v.false_colors);
-        alike(self) == alike(other) && self.slots >= other.slots && self.bounded >= other.bounded
+        let able = |v: Self| (v.slots, v.bounded, !v.levels_alike);
+        let (ours, theirs) = (able(self), able(other));
+        let draws = ours.0 >= theirs.0 && ours.1 >= theirs.1 && ours.2 >= theirs.2;
+        alike(self) == alike(other) && draws
     }
 
     /// Those that draw, or stand in for those that do, when the camera goes far away, as many channels as there are are
-    /// shown, or what is drawn of values changes.
+    /// shown, other levels of some are wanted, or what is drawn of values changes.
     pub(crate) fn likely_next(self, channels: usize) -> Vec<Self> {
-        let bounded = Self {
+        let able = Self {
             bounded: true,
             ..self
         };
+        let able = able.with_levels(false);
         let most = Self::new(channels.min(MOST_CHANNELS), 0, false, 0, false).slots;
         let all = Self {
             slots: most.max(self.slots),
-            ..bounded
+            ..able
         };
         let modes = [MODE_EMISSION_ABSORPTION, MODE_MAXIMUM, MODE_ISO_SURFACE];
-        let modes = modes.map(|mode| Self { mode, ..bounded });
+        let modes = modes.map(|mode| Self { mode, ..able });
         let colors = [FALSE_NONE, FALSE_RESIDENCY, FALSE_LEVEL];
         let colors = colors.map(|false_colors| Self {
             false_colors,
-            ..bounded
+            ..able
         });
-        let mut next = vec![bounded, all];
+        let mut next = vec![able, all.with_levels(false)];
         next.extend(modes);
         next.extend(colors);
         next
@@ -288,6 +303,7 @@ pub(crate) fn ray_cast(variant: Variant, counting: Counting) -> String {
         joined,
         false_colors,
         bounded,
+        levels_alike,
     } = variant;
     // With one channel there is nothing to count.
     let count = if slots == 1 {
@@ -297,6 +313,7 @@ pub(crate) fn ray_cast(variant: Variant, counting: Counting) -> String {
     };
     format!(
         "const SLOTS = {slots}u;\nconst MODE = {mode}u;\nconst JOINED = {joined};\nconst FALSE_COLORS = {false_colors}u;\nconst BOUNDED = {bounded};\n\
+         const LEVELS_ALIKE = {levels_alike};\n\
          fn channel_count() -> u32 {{ return {count}; }}\n{RAY_CAST}{}",
         counting.source()
     )
@@ -311,6 +328,8 @@ const RAY_CAST: &str = concat!(
     include_str!("shaders/lib/count.wgsl"),
     include_str!("shaders/memory.wgsl"),
     include_str!("shaders/octree.wgsl"),
+    include_str!("shaders/bricks_ahead.wgsl"),
+    include_str!("shaders/samples.wgsl"),
     include_str!("shaders/ray_cast.wgsl"),
 );
 
@@ -355,6 +374,7 @@ mod tests {
                 naga::valid::Capabilities::empty(),
             );
             let variant = Variant::new(channels, mode, joined, false_colors, far);
+            let variant = variant.with_levels(channels == 4);
             let source = ray_cast(variant, counting);
             let module = parsed(&source);
             validator
@@ -375,6 +395,9 @@ mod tests {
             ..few
         };
         assert!(far.stands_in_for(few) && !few.stands_in_for(far));
+        let unlike = many.with_levels(false);
+        assert!(unlike.stands_in_for(many) && !many.stands_in_for(unlike));
+        assert_eq!(few.with_levels(false), few);
         for other in [
             Variant {
                 mode: MODE_MAXIMUM,
@@ -403,7 +426,8 @@ mod tests {
             );
             for channels in 1..10 {
                 let mode = MODE_EMISSION_ABSORPTION;
-                assert!(drawn(Variant::new(channels, mode, false, FALSE_NONE, far)));
+                let variant = Variant::new(channels, mode, false, FALSE_NONE, far);
+                assert!(drawn(variant) && drawn(variant.with_levels(false)));
             }
         }
     }

@@ -38,7 +38,7 @@ impl Compiled {
     /// One that draws the same, as cheaply as there is one.
     fn stand_in(&self, wanted: Variant) -> Option<&wgpu::ComputePipeline> {
         let able = self.ready.iter().filter(|(v, _)| v.stands_in_for(wanted));
-        let cheapest = able.min_by_key(|(variant, _)| (variant.slots, variant.bounded));
+        let cheapest = able.min_by_key(|(v, _)| (v.slots, v.bounded, !v.levels_alike));
         cheapest.map(|(_, pipeline)| pipeline)
     }
 }

@@ -14,7 +14,7 @@ use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Polarity, Volume, VoxelKind};
 
 use crate::channel::{self, ChannelError, ChannelView};
-use crate::frame::{Scene, Seen, false_colors_of, frame_uniform, is_far, mode_of};
+use crate::frame::{Scene, Seen, are_levels_alike, false_colors_of, frame_uniform, is_far, mode_of};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
 use crate::layout::Variant;
@@ -375,6 +375,7 @@ impl Renderer {
             false_colors_of(view.false_colors),
             is_far(&uniform),
         );
+        let variant = variant.with_levels(are_levels_alike(&uniform));
         let readback = self.readbacks.iter_mut().find(|r| r.staging.is_idle());
         let target = readback.as_ref().map(|r| r.staging.buffer());
         let bands = self.options.bands;

@@ -82,15 +82,12 @@ struct Found {
     span_log2: u32, // edge of what lies under the entry [log2 of bricks]
 }
 
-// A page table block at the last step.
-struct LeafBlock {
-    at: vec3u,
-    level: u32, // one more than the level; 0 is none
-    block: u32, // the entry that leads to it
-}
-
-// The one used last, per channel: most bricks along a ray share it.
-var<private> last: array<LeafBlock, SLOTS>;
+// The place of the page table block used last, which most bricks along a ray share, all channels' as well: its level, one more than
+// it; 0 is none. Of which channels the entry that leads there is known, as bits; and these entries.
+var<private> last_at: vec3u;
+var<private> last_level: u32;
+var<private> last_known: u32;
+var<private> last_block: array<u32, SLOTS>;
 
 // Entries read, of the directory and of page tables.
 var<private> lookups: u32;
@@ -144,9 +141,14 @@ fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found
     let edge = steady.block_edge_log2;
     let inside = vec3u((1u << edge) - 1u);
     let block_at = brick >> vec3u(edge);
-    let is_last = level + 1u == last[channel].level && all(block_at == last[channel].at);
+    let bit = 1u << channel;
+    let is_near = level + 1u == last_level && all(block_at == last_at);
+    last_known = select(0u, last_known, is_near);
+    last_at = block_at;
+    last_level = level + 1u;
+    let is_last = (last_known & bit) != 0u;
     var span = edge;
-    var value = last[channel].block;
+    var value = last_block[channel];
     var physical = 0u;
     if !is_last {
         span = edge * (steady.depth - 1u);
@@ -159,7 +161,8 @@ fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found
         loop {
             let slot = value & ~STALE;
             if span == edge {
-                last[channel] = LeafBlock(block_at, level + 1u, value);
+                last_block[channel] = value;
+                last_known |= bit;
             }
             let block = slot - FIRST_SLOT;
             if !is_last {
@@ -170,7 +173,7 @@ fn find(channel: u32, level: u32, brick: vec3u, base: u32, size: vec3u) -> Found
             let entry = (block << (3u * edge)) + ((((at.z << edge) + at.y) << edge) + at.x);
             physical = steady.directory_entries + entry;
             value = tables[entry];
-        lookups += 1u;
+            lookups += 1u;
             continuing {
                 break if span == 0u || (value & ~STALE) < FIRST_SLOT;
             }
