@@ -18,7 +18,6 @@
 //! A TIFF is read as it is decoded, so that its pixels are in memory once; other files are read whole, and
 //! refused where they are longer than [`Wanted::size`] can explain.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 
@@ -27,6 +26,7 @@ use saccade_core::volume::Dtype;
 use sniff::Kind;
 
 use crate::pyramid::Voxel;
+use crate::storage::open_regular;
 
 mod jpeg;
 mod png;
@@ -285,6 +285,15 @@ impl ImageError {
     pub fn is_transient(&self) -> bool {
         matches!(self, Self::Incomplete { .. } | Self::Read { .. })
     }
+
+    /// Whether what should be read is a named pipe, a socket or a device, of which nothing is read.
+    pub fn is_of_no_file(&self) -> bool {
+        let kind = match self {
+            Self::Read { source, .. } => source.kind(),
+            _ => return false,
+        };
+        kind == std::io::ErrorKind::NotSeekable
+    }
 }
 
 /// Decodes a TIFF, PNG or JPEG file, told apart by its first bytes, to grey of 8 bits.
@@ -323,7 +332,7 @@ pub fn read_size(path: &Path) -> Result<[u32; 2], ImageError> {
         source,
         path: path.to_owned(),
     };
-    let mut file = File::open(path).map_err(failed)?;
+    let mut file = open_regular(path).map_err(failed)?;
     let mut head = Vec::new();
     let mut start = file.by_ref().take(sniff::HEAD);
     start.read_to_end(&mut head).map_err(failed)?;
@@ -350,7 +359,7 @@ pub fn read_bits(path: &Path) -> Result<u32, ImageError> {
         source,
         path: path.to_owned(),
     };
-    let mut file = File::open(path).map_err(failed)?;
+    let mut file = open_regular(path).map_err(failed)?;
     let mut head = Vec::new();
     let mut start = file.by_ref().take(sniff::HEAD);
     start.read_to_end(&mut head).map_err(failed)?;
@@ -389,7 +398,7 @@ pub fn decode_file_as(path: &Path, wanted: Wanted) -> Result<Image, ImageError> 
         source,
         path: path.to_owned(),
     };
-    let mut file = File::open(path).map_err(failed)?;
+    let mut file = open_regular(path).map_err(failed)?;
     let len = file.metadata().map_err(failed)?.len();
     let mut head = Vec::new();
     file.by_ref()

@@ -42,6 +42,7 @@ mod again;
 mod list;
 mod listed;
 mod looking;
+pub(crate) mod no_folder;
 mod pattern;
 mod scan;
 mod stamp;
@@ -149,6 +150,8 @@ pub struct Watch<F> {
     seen: bool,
     /// Whether it is still to be said that no file fits the pattern.
     tells_misfits: bool,
+    /// Where folders should be and others lie, as it was said last.
+    blocked: Vec<String>,
     held_up: HeldUp,
 }
 
@@ -289,6 +292,7 @@ impl<F: Folders> Watch<F> {
             unread: VecDeque::new(),
             seen: false,
             tells_misfits: false,
+            blocked: Vec::new(),
             held_up: HeldUp::default(),
         };
         watch.take_over()?;
@@ -425,6 +429,8 @@ impl<F: Folders> Watch<F> {
             };
             let size = match read_size(&self.folder.join(&unread.found.file)) {
                 Ok([x, y]) => UVec2::new(x, y),
+                // Nobody is about to write a pipe whole: ingest says what it is.
+                Err(e) if e.is_of_no_file() => UVec2::ONE,
                 Err(_) => {
                     if stamp != unread.stamp {
                         (unread.stamp, unread.since) = (stamp, now);
@@ -502,6 +508,11 @@ impl<F: Folders> Looks for Watch<F> {
             log::warn!("{why}; files that fit are waited for");
             self.tells_misfits = false;
         }
+        let blocked = self.scanner.blocked();
+        for why in { blocked.iter() }.filter(|why| !self.blocked.contains(why)) {
+            log::warn!("{why}");
+        }
+        self.blocked = blocked;
         looked
     }
 
@@ -514,7 +525,10 @@ impl<F: Folders> Looks for Watch<F> {
     }
 
     fn waits_for(&self) -> Option<String> {
-        self.unmatched()
+        let said: Vec<_> = { self.unmatched().into_iter() }
+            .chain(self.blocked.iter().cloned())
+            .collect();
+        (!said.is_empty()).then(|| said.join("; "))
     }
 
     fn held_up(&self) -> &HeldUp {

@@ -22,7 +22,7 @@ use super::reasons::Called;
 use super::{IngestError, IngestOptions};
 use crate::progress::Progress;
 use crate::sense::{CHECK, nonsense};
-use crate::watch::{BEFORE_FIRST, Stamp};
+use crate::watch::{BEFORE_FIRST, Stamp, no_folder};
 use crate::words::with_causes;
 
 /// What a file looks like from outside; another look means that someone writes to it.
@@ -420,7 +420,9 @@ fn build(
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
         // Of a file that is just being written, the head may be half there.
         ImageError::Broken { .. } | ImageError::TooLarge { .. } => Refusal::Broken(e.to_string()),
-        ImageError::Read { ref source, .. } => Refusal::Incomplete(format!("{e}: {source}")),
+        ImageError::Read { ref source, .. } => Refusal::Incomplete(
+            no_folder::why_on_the_way(path).unwrap_or_else(|| format!("{e}: {source}")),
+        ),
         // Who has neither volume.json nor records has options.
         ImageError::Depth { bits, volume } if watched => Refusal::Never(format!(
             "the image has {bits} bits per sample, but the volume has {volume}; convert it to {volume} bit grey, or \

@@ -299,9 +299,12 @@ impl<F: Folders> ListWatch<F> {
             ));
         }
         if let Some(file) = first_absent {
+            let blocked = self.index.blocked(file);
+            let blocked = blocked.map(|why| format!(" ({why})"));
             said.push(format!(
-                "{absent} of the {all} images that the list names are not below {}, such as {file:?}",
-                self.folder.display()
+                "{absent} of the {all} images that the list names are not below {}, such as {file:?}{}",
+                self.folder.display(),
+                blocked.unwrap_or_default()
             ));
         }
         said.extend(self.unclear());

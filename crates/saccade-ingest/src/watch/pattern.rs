@@ -116,6 +116,16 @@ impl Pattern {
         fit(part, name, &mut place).is_ok().then_some(place)
     }
 
+    /// Whether a name can hardly be but that of such a folder: it is as the pattern spells it, or has its numbers.
+    pub(super) fn is_a_folder(&self, depth: usize, name: &str) -> bool {
+        let Some(part) = self.parts.get(depth).filter(|_| depth < self.depth()) else {
+            return false;
+        };
+        let is_certain = part.iter().all(|piece| matches!(piece, Piece::Text(_)))
+            || part.iter().any(|piece| matches!(piece, Piece::Number(_)));
+        is_certain && fit(part, name, &mut Place::default()).is_ok()
+    }
+
     /// What a file's name says, with what its folders said.
     pub fn file(&self, name: &str, known: &Place) -> Option<Place> {
         let mut place = known.clone();

@@ -1,6 +1,6 @@
 //! Which files are new, found with few questions to the file system.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
@@ -11,7 +11,7 @@ use saccade_archive::clock::{Clock as _, SystemClock};
 
 use super::again::Again;
 use super::stamp::Seen;
-use super::{Pattern, Place, Stamp};
+use super::{Pattern, Place, Stamp, no_folder};
 
 /// What a folder holds.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -124,6 +124,9 @@ pub struct Counts {
 /// added in the same tick after the folder was listed.
 const SETTLED: Duration = Duration::from_secs(3);
 
+/// Of what lies where folders should be, the first so many are told: they are asked for at each look.
+const MOST_BLOCKED: usize = 16;
+
 struct Known {
     /// Below the watched folder; empty for itself.
     path: PathBuf,
@@ -168,6 +171,8 @@ pub struct Scanner<F> {
     went_round: bool,
     /// Folders that could not be looked into, and why.
     closed: HashMap<usize, io::ErrorKind>,
+    /// What lies where folders should be, below the watched folder.
+    blocked: BTreeSet<PathBuf>,
     /// When the last of them was told of.
     told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
@@ -201,6 +206,7 @@ impl<F: Folders> Scanner<F> {
             again: Again::default(),
             went_round: false,
             closed: HashMap::new(),
+            blocked: BTreeSet::new(),
             told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
             counts: Counts::default(),
@@ -221,6 +227,25 @@ impl<F: Folders> Scanner<F> {
     /// What was met so far.
     pub fn counts(&self) -> &Counts {
         &self.counts
+    }
+
+    /// Why there are no images where the pattern has folders of them: of what was met there and is none, and is so still.
+    pub(super) fn blocked(&mut self) -> Vec<String> {
+        let (mut said, root) = (Vec::new(), &self.root);
+        self.blocked.retain(|path| {
+            let why = no_folder::why(&root.join(path));
+            let is_blocked = why.is_some();
+            said.extend(why);
+            is_blocked
+        });
+        said
+    }
+
+    /// Notes what lies where a folder should be.
+    fn block(&mut self, path: PathBuf) {
+        if self.blocked.len() < MOST_BLOCKED {
+            self.blocked.insert(path);
+        }
     }
 
     /// Notes one that does not fit.
@@ -344,8 +369,11 @@ impl<F: Folders> Scanner<F> {
                     };
                 }
                 Err(e) => {
-                    // Once for each reason.
-                    if self.closed.insert(folder, e.kind()) != Some(e.kind()) {
+                    let is_new = self.closed.insert(folder, e.kind()) != Some(e.kind());
+                    if e.kind() == io::ErrorKind::NotADirectory {
+                        self.block(self.known[folder].path.clone());
+                    } else if is_new {
+                        // Once for each reason.
                         log::warn!("cannot look into {}: {e}", path.display());
                     }
                 }
@@ -404,7 +432,11 @@ impl<F: Folders> Scanner<F> {
         self.counts.files += count;
         let place = self.pattern.file(&entry.name, place).filter(|_| as_deep);
         let Some(place) = place else {
+            let in_the_way = self.pattern.is_a_folder(*depth, &entry.name);
             self.misfit(&below, false, as_deep);
+            if in_the_way {
+                self.block(below);
+            }
             return;
         };
         self.counts.fit += 1;

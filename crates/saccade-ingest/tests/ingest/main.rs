@@ -9,6 +9,7 @@
 mod bare;
 mod crashes;
 mod faults;
+mod in_the_way;
 mod kill;
 mod kinds;
 mod lists;

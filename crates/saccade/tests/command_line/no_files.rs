@@ -6,6 +6,7 @@ use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
 use super::errors::text;
+use super::server_away::{Program, says};
 use super::update::ended;
 use super::{archive, done, saccade, stderr};
 
@@ -94,4 +95,55 @@ fn a_pipe_in_the_place_of_a_pyramid_is_damage_and_mended() {
     let catalog = Path::new(&archive).join("catalog.sqlite");
     put_a_pipe(&catalog);
     ended(&run(&["check", &archive]), 1, &["catalog.sqlite"]);
+}
+
+/// It is told once, with what to do, and what comes in its place is taken in.
+#[cfg(unix)]
+#[test]
+fn a_pipe_in_the_place_of_a_folder_of_images_is_told_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive, new] = ["scope", "archive", "new"].map(|name| folder.path().join(name));
+    let picture = |folder: &Path| {
+        fs::create_dir_all(folder).unwrap();
+        let grey = image::GrayImage::from_pixel(40, 30, image::Luma([9]));
+        grey.save(folder.join("r0_c0.png")).unwrap();
+    };
+    picture(&scope.join("s0"));
+    let second = scope.join("s1");
+    fs::write(&second, "").unwrap();
+    put_a_pipe(&second);
+    let of_names = [
+        "--pattern",
+        "s{section}/r{row}_c{column}.png",
+        "--extent",
+        "99,99,9",
+    ];
+    let sized = ["--voxel", "4", "--pitch", "40,30"];
+    let ingest = ["ingest", text(&scope), text(&archive)];
+    let ingest = [&ingest[..], &of_names, &sized].concat();
+    let once = run(&[&ingest[..], &["--once"]].concat());
+    ended(
+        &once,
+        0,
+        &["1 tiles taken in", "a named pipe", text(&second)],
+    );
+    let following = Program::start_with(&ingest, &[]);
+    let said = says(&following.stderr, "a named pipe");
+    assert!(
+        said.contains("put the folder itself there") && said.contains(text(&second)),
+        "{said}"
+    );
+    std::thread::sleep(Duration::from_secs(2));
+    picture(&new);
+    fs::remove_file(&second).unwrap();
+    fs::rename(&new, &second).unwrap();
+    let mut before: Vec<String> = Vec::new();
+    while let Ok(line) = following.stderr.recv_timeout(Duration::from_secs(60)) {
+        if line.contains("1 of 1 tiles") {
+            assert!(!before.concat().contains("pipe"), "{before:#?}");
+            return;
+        }
+        before.push(line);
+    }
+    panic!("the folder is not taken in: {before:#?}");
 }

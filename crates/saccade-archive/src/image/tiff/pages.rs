@@ -9,6 +9,7 @@ use tiff::decoder::Decoder;
 use super::super::sniff::{self, HEAD, Kind};
 use super::super::{Image, ImageError, Wanted};
 use super::{check_page, decode_page, open, sort, unsupported};
+use crate::storage::open_regular;
 
 /// The pages of a TIFF file, each an image like that of a file of its own.
 ///
@@ -38,7 +39,7 @@ impl Pages {
             source,
             path: path.to_owned(),
         };
-        let mut file = File::open(path).map_err(failed)?;
+        let mut file = open_regular(path).map_err(failed)?;
         let len = file.metadata().map_err(failed)?.len();
         let mut head = Vec::new();
         let mut start = file.by_ref().take(HEAD);

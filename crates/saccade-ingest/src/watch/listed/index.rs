@@ -15,7 +15,7 @@ use saccade_archive::acquisition::image_path;
 pub(super) use saccade_archive::acquisition::tile_list::base;
 use saccade_archive::acquisition::tile_list::decoded;
 
-use super::super::{Entry, Folders, Next};
+use super::super::{Entry, Folders, Next, no_folder};
 
 /// A folder's time counts only once it is this old: file systems stamp coarsely.
 const SETTLED: Duration = Duration::from_secs(3);
@@ -254,6 +254,12 @@ impl Index {
         folder(file).or_else(|| folder(&decoded(file)?))
     }
 
+    /// Why what a list calls `file` cannot be there, where something else lies in the place of its folder.
+    pub(super) fn blocked(&self, file: &str) -> Option<String> {
+        let blocked = |file: &str| no_folder::why_on_the_way(&image_path(&self.root, file)?);
+        blocked(file).or_else(|| blocked(&decoded(file)?))
+    }
+
     /// Looks again at some of what is nothing to read: links may lead to something later.
     fn look_at_odd(&mut self) {
         const AT_ONCE: usize = 64;
@@ -324,7 +330,9 @@ impl Index {
                 Err(e) => {
                     // Once for each reason.
                     if self.folders[self.at].closed != Some(e.kind()) {
-                        log::warn!("cannot look into {}: {e}", path.display());
+                        let blocked = no_folder::why(&path);
+                        let cannot = || format!("cannot look into {}: {e}", path.display());
+                        log::warn!("{}", blocked.unwrap_or_else(cannot));
                     }
                     Some(e.kind())
                 }
