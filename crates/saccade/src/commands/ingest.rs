@@ -301,16 +301,24 @@ impl Ingest {
         kept: Option<&Path>,
         cancel: &Cancel,
     ) -> Result<Option<Followed>> {
-        let (mut said, settled) = (false, self.bare.settled());
+        /// Looks at the same mistake after which it is told where another one was: each part of a file that is being
+        /// written may show one of its own.
+        const LOOKS: u32 = 12;
+        let settled = self.bare.settled();
+        let (mut said, mut wrong, mut looks) = (String::new(), String::new(), 0);
         loop {
             let error = match self.bare.followed(&self.acquisition, name, kept) {
                 Ok(followed) => return Ok(Some(followed)),
                 Err(error) if self.once || !is_being_written(&error, settled) => return Err(error),
                 Err(error) => error,
             };
-            if !std::mem::replace(&mut said, true) {
+            let now = format!("{error:#}");
+            looks = if now == wrong { looks + 1 } else { 0 };
+            wrong = now;
+            if wrong != said && (said.is_empty() || looks >= LOOKS) {
+                said.clone_from(&wrong);
                 log::warn!(
-                    "{error:#}; it was written just now, and is read again in case it is not whole yet, until it has not changed \
+                    "{said}; it was written just now, and is read again in case it is not whole yet, until it has not changed \
                      for {} s",
                     settled.as_secs()
                 );

@@ -300,6 +300,33 @@ fn a_list_that_is_being_written_at_the_start_is_waited_for() {
     assert_failed(&run(ingest), 1, &["list.json"]);
 }
 
+/// Of a slip in it is told at once, and of the next one, too.
+#[test]
+fn a_description_with_a_slip_is_told_until_it_is_mended() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&scope).unwrap();
+    picture(&scope, "a.png", 10);
+    let tile = r#"{"record":"tile","tile":"a","file":"a.png","section":0,"size":[40,30],"transform":[1,0,0,1,0,0]}"#;
+    std::fs::write(scope.join("tiles.jsonl"), format!("{tile}\n")).unwrap();
+    let description = scope.join("volume.json");
+    let write = |text: &str| std::fs::write(&description, text).unwrap();
+    write(r#"{"name":"cortex","extent":[100,100,5],"voxel_nm":[4,4,40}"#);
+    let ingest = ["ingest", text(&scope), text(&archive)];
+    let once = run([&ingest[..], &["--once"]].concat());
+    assert_failed(&once, 1, &["cannot understand", "volume.json", "column 57"]);
+    let following = Program::start_with(&ingest, &[]);
+    let said = says(&following.stderr, "is read again");
+    for part in [text(&description), "it should hold", "column 57", "30 s"] {
+        assert!(said.contains(part), "{said}");
+    }
+    write(r#"{"name":"cortex","extend":[100,100,5],"voxel_nm":[4,4,40]}"#);
+    let said = says(&following.stderr, "is read again");
+    assert!(said.contains("extend"), "{said}");
+    write(r#"{"name":"cortex","extent":[100,100,5],"voxel_nm":[4,4,40]}"#);
+    says(&following.stderr, "1 of 1 tiles");
+}
+
 /// What it leads to may be whole or not.
 #[cfg(unix)]
 #[test]
