@@ -14,7 +14,9 @@ use saccade_core::transfer::TransferFunction;
 use saccade_core::volume::{Dtype, Polarity, Volume, VoxelKind};
 
 use crate::channel::{self, ChannelError, ChannelView};
-use crate::frame::{Scene, Seen, are_levels_alike, false_colors_of, frame_uniform, is_far, mode_of};
+use crate::frame::{
+    Scene, Seen, are_levels_alike, false_colors_of, frame_uniform, is_far, mode_of,
+};
 use crate::gpu::Gpu;
 use crate::image::{Image, ReadError, read_image};
 use crate::layout::Variant;

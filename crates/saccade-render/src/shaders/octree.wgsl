@@ -38,6 +38,21 @@ var<private> largest_seen: array<f32, SLOTS>;
 
 var<private> nodes_visited: u32;
 
+// A ray that came upon nothing to skip in so many regions in a row looks one depth less closely for it, and after some more another
+// one: as long as what it passes is seen, looking costs more than it saves. What is hidden is looked at closely from there on.
+const VAIN_LOOKS = 8u;
+const VAIN_LOOKS_MORE = 4u;
+const MOST_SPARED = 3u;
+
+// Regions in a row of which a look as close as the last one's found no more channels hidden than a look from farther away.
+var<private> vain_looks: u32;
+
+// Depths of the octree that a ray does not go down to for now.
+fn spared_depths() -> u32 {
+    let more = vain_looks + VAIN_LOOKS_MORE - min(vain_looks + VAIN_LOOKS_MORE, VAIN_LOOKS);
+    return min(more / VAIN_LOOKS_MORE, MOST_SPARED);
+}
+
 // The level of a channel that is drawn where `level` is wanted.
 fn channel_level(channel: u32, level: u32) -> u32 {
     let here = channel_of(channel);
@@ -118,11 +133,12 @@ fn node_texel(node: u32, channel: u32) -> vec4u {
 }
 
 // The largest node around a sample in which each channel is hidden, all alike or nearly all seen, else the
-// deepest there. One walk for all channels [001 alg. 7.1].
+// deepest there, less what is spared. One walk for all channels [001 alg. 7.1].
 //
 // Starts from the nodes that the sample before was in [001 section 9.4]: those it shares with it
 // were not enough.
-fn region_at(level: u32, deepest: u32, depth: f32, ray: vec3f) -> Region {
+fn region_at(level: u32, deepest_known: u32, depth: f32, ray: vec3f) -> Region {
+    let deepest = deepest_known - min(spared_depths(), deepest_known);
     let cell = cell_at(depth, ray);
     let everything = all_channels();
     var at = 0u;
@@ -191,8 +207,8 @@ fn region_at(level: u32, deepest: u32, depth: f32, ray: vec3f) -> Region {
                     alike |= bit;
                     settled |= bit;
                     uniform_stored[c] = f32(low) / steady.largest;
-                } else if visible * 4u > countOneBits(bins) * 3u {
-                    // Where nearly all is seen, a closer look finds little to skip.
+                } else if low > 0u && visible * 4u > countOneBits(bins) * 3u {
+                    // Where nearly all is seen, a closer look finds little to skip. Bins do not say how much of it is nothing at all.
                     settled |= bit;
                 }
             }
@@ -218,6 +234,11 @@ fn region_at(level: u32, deepest: u32, depth: f32, ray: vec3f) -> Region {
         is_new = true;
     }
     path_depth = at;
+    var hidden_from_afar = 0u;
+    if SLOTS > 1u {
+        hidden_from_afar = path_known.near.y & 0xffffu;
+    }
+    vain_looks = select(vain_looks + 1u, 0u, (hidden & ~hidden_from_afar) != 0u);
     return Region(hidden, alike, leaving_node(cell, at, ray));
 }
 

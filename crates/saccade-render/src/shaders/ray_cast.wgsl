@@ -309,6 +309,10 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
         if !going {
             break;
         }
+        // What a closer look may find hidden is not asked for.
+        let looks_closer = lost != 0u && spared_depths() > 0u;
+        vain_looks = select(vain_looks, 0u, looks_closer);
+        lost = select(lost, 0u, looks_closer);
         for (var c = 0u; c < channel_count(); c += 1u) {
             let bit = 1u << c;
             if (lost & bit) != 0u {

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeSet;
 
-use glam::{UVec2, UVec3};
+use glam::{DVec3, UVec2, UVec3};
 use saccade_core::brick::{BRICK_STORED_VOXELS, BrickId};
 use saccade_core::camera::Camera;
 use saccade_core::transfer::{OpacityPoint, TransferFunction};
+use saccade_core::volume::Polarity;
 use saccade_core::voxel_box::VoxelBox;
 use saccade_render::{
     BrickVoxels, FrameReport, Gpu, Image, Renderer, RendererOptions, Traversal, View,
@@ -300,4 +301,133 @@ fn what_a_source_knows_to_be_hidden_is_never_asked_for() {
     assert!(db >= SAME, "{db:.1} dB");
     let resident = [&with.memory(), &without.memory].map(|m| m.bricks_resident);
     assert!(resident[0] < resident[1], "{resident:?} resident");
+}
+
+/// Cubes of four voxels, every second of which is seen, so that each leaf holds both; nothing of what lies where `gap` says.
+fn chequered(extent: UVec3, gap: impl Fn(f64) -> bool) -> Scene {
+    let point = |(value, opacity): (f32, f32)| OpacityPoint {
+        value: value / 255.0,
+        opacity,
+    };
+    let opacity = [(100.0, 0.0), (110.0, 0.2)];
+    let transfer = TransferFunction {
+        opacity: opacity.map(point).to_vec(),
+        opacity_length_nm: 2e5,
+        polarity: Polarity::Bright,
+        ..tissue().transfer
+    };
+    let nm = 1000.0;
+    Scene::new(extent, DVec3::splat(nm), transfer, |at| {
+        let cube = (at / (4.0 * nm)).floor();
+        let is_seen = (cube.x + cube.y + cube.z).rem_euclid(2.0) < 0.5 && !gap(at.x / nm);
+        if is_seen { 200.0 } else { 20.0 }
+    })
+}
+
+/// Looks along x, from where it is 0, with rays that are nearly parallel and pass all of it.
+fn along_x(scene: &Scene) -> View {
+    let around = Camera::around(&scene.volume);
+    let turned = (0..4).map(|quarter| Camera {
+        yaw: 90.0 * f64::from(quarter),
+        pitch: 0.0,
+        fov: 3.0,
+        distance_nm: 2.0 * scene.volume.size_nm().x,
+        ..around
+    });
+    let along = |camera: &Camera| camera.physical_from_eye_axes().z_axis.x.abs() > 0.999;
+    let mut cameras = turned.filter(along);
+    let ahead = |camera: &Camera| camera.physical_from_eye_axes().z_axis.x > 0.0;
+    let camera = cameras.find(ahead).expect("one of four");
+    View {
+        // Of the finest level.
+        lod_bias: -8.0,
+        ..View::new(camera, SIZE)
+    }
+}
+
+#[test]
+fn rays_that_find_nothing_to_skip_look_less_often() {
+    let Some(gpu) = gpu() else { return };
+    let scene = chequered(UVec3::new(224, 40, 40), |_| false);
+    let view = along_x(&scene);
+    let cells = Some([8, 8, 8]);
+    let mut with = renderer(&gpu, &scene, Traversal::ResidencyOctree, cells);
+    let (got, report) = picture(&mut with, &view, &scene);
+    let mut without = renderer(&gpu, &scene, Traversal::PageTables, None);
+    let (want, all) = picture(&mut without, &view, &scene);
+    assert!(psnr(&got, &want) >= SAME);
+    // Nothing is skipped, so that each of the leaves, of sixteen samples at most where rays go straight, would be visited.
+    let [samples, of_all] = [&report, &all].map(|report| report.statistics.samples);
+    assert_eq!(samples, of_all);
+    let nodes = u64::from(report.statistics.nodes);
+    assert!(nodes * 14 < samples, "{nodes} nodes, {samples} samples");
+    // Where there is something to skip behind all that, it is skipped.
+    let scene = chequered(UVec3::new(224, 40, 40), |x| x > 144.0);
+    let mut with = renderer(&gpu, &scene, Traversal::ResidencyOctree, cells);
+    let (_, report) = picture(&mut with, &view, &scene);
+    let half = report.statistics.samples;
+    assert!(half * 4 < samples * 3, "{half} of {samples} samples");
+}
+
+#[test]
+fn what_is_hidden_behind_much_that_is_seen_is_not_asked_for() {
+    let Some(gpu) = gpu() else { return };
+    let scene = chequered(UVec3::new(320, 40, 40), |x| (250.0..294.0).contains(&x));
+    let view = along_x(&scene);
+    let mut renderer = renderer(&gpu, &scene, Traversal::ResidencyOctree, Some([8, 8, 8]));
+    let bricks = VoxelBox::new(UVec3::new(8, 0, 0), UVec3::new(9, 2, 2));
+    let bricks = bricks.iter().map(|at| BrickId::new(0, 0, at).unwrap());
+    let hidden: BTreeSet<_> = bricks.collect();
+    let (mut noted, mut behind) = (BTreeSet::new(), false);
+    for _ in 0..200 {
+        let report = caught_up(&mut renderer, &view);
+        if report.is_complete() {
+            break;
+        }
+        for &id in &report.misses {
+            if hidden.contains(&id) {
+                // Before it is noted nothing is known.
+                assert!(!noted.contains(&id), "{id:?} is asked for again");
+                if renderer.note_range(id, [20, 20]) {
+                    noted.insert(id);
+                } else {
+                    deliver(&mut renderer, &scene, id);
+                }
+                continue;
+            }
+            behind |= id.level() == 0 && id.brick().x == 9;
+            deliver(&mut renderer, &scene, id);
+        }
+    }
+    assert!(frame(&mut renderer, &view).is_complete());
+    assert!(behind && !noted.is_empty(), "rays end before they come that far");
+}
+
+/// That all values are seen does not say that there is something everywhere.
+#[test]
+fn what_was_not_acquired_is_skipped_among_what_is_all_seen() {
+    let Some(gpu) = gpu() else { return };
+    let plain = chequered(UVec3::splat(8), |_| false);
+    let transfer = TransferFunction {
+        opacity: vec![OpacityPoint {
+            value: 0.0,
+            opacity: 0.01,
+        }],
+        ..plain.transfer
+    };
+    // Half of it, nowhere a whole brick.
+    let extent = UVec3::new(192, 40, 40);
+    let scene = Scene::new(extent, DVec3::splat(1000.0), transfer, |at| {
+        let is_there = (at.x / 1000.0 + 10.0).rem_euclid(64.0) < 32.0;
+        if is_there { 150.0 } else { 0.0 }
+    });
+    let view = along_x(&scene);
+    let mut with = renderer(&gpu, &scene, Traversal::ResidencyOctree, Some([8, 8, 8]));
+    let (got, with) = picture(&mut with, &view, &scene);
+    let mut without = renderer(&gpu, &scene, Traversal::PageTables, None);
+    let (want, without) = picture(&mut without, &view, &scene);
+    let db = psnr(&got, &want);
+    assert!(db >= SAME, "{db:.1} dB");
+    let samples = [&with, &without].map(|report| report.statistics.samples);
+    assert!(samples[0] * 5 < samples[1] * 4, "{samples:?}");
 }
