@@ -184,11 +184,12 @@ pub(crate) fn table_2(settings: &Settings) -> Result<Vec<Row>> {
             .zip(published.into_iter().zip(ids))
         {
             let views = channel(transfer(semi_transparent));
-            let (ours, tree, extent) = if set < 3 {
+            let (ours, tree, rays, extent) = if set < 3 {
                 let tissue = Tissue::new(extent)?;
                 let view = face(&tissue.volume, picture(scale), 0);
-                let [ours, tree] = both(gpu, &tissue.volume, &tissue, &views, &view, scale)?;
-                (ours, tree, extent)
+                let ([ours, tree], rays) =
+                    both(gpu, &tissue.volume, &tissue, &views, &view, scale)?;
+                (ours, tree, rays, extent)
             } else {
                 let extent = UVec3::splat(match scale {
                     Scale::Small => 256,
@@ -208,8 +209,9 @@ pub(crate) fn table_2(settings: &Settings) -> Result<Vec<Row>> {
                     lod_bias: -20.0,
                     ..View::new(camera, picture(scale))
                 };
-                let [ours, tree] = both(gpu, &sensor.volume, &sensor, &views, &view, scale)?;
-                (ours, tree, extent)
+                let ([ours, tree], rays) =
+                    both(gpu, &sensor.volume, &sensor, &views, &view, scale)?;
+                (ours, tree, rays, extent)
             };
             let row = Row::new(
                 id,
@@ -225,6 +227,7 @@ pub(crate) fn table_2(settings: &Settings) -> Result<Vec<Row>> {
                 "volume",
                 format!("{} x {} x {} voxels", extent.x, extent.y, extent.z),
             )
+            .setting("a ray", rays)
             .setting("octree_fps", 1e3 / mean(&tree))
             .setting("time", time_of(gpu))
             .setting("ours over the octree's", mean(&tree) / mean(&ours))
@@ -244,7 +247,7 @@ pub(crate) fn table_2(settings: &Settings) -> Result<Vec<Row>> {
     Ok(rows)
 }
 
-/// Times of ours and of an octree entered at the top \[ms\].
+/// Times of ours and of an octree entered at the top \[ms\], and what the rays of each do, in words.
 fn both(
     gpu: &Gpu,
     volume: &std::sync::Arc<Volume>,
@@ -252,7 +255,7 @@ fn both(
     views: &[ChannelView],
     view: &View,
     scale: Scale,
-) -> Result<[Vec<f64>; 2]> {
+) -> Result<([Vec<f64>; 2], String)> {
     const RUNS: usize = 5;
     // One volume here is dense at 2048 voxels an axis.
     let bytes = if scale == Scale::Paper {
@@ -269,7 +272,17 @@ fn both(
     let (report, _) = settle_loading(&mut renderer, view, source)?;
     ensure!(report.memory_bias == 0.0, "the bricks did not fit");
     let mut tree = Baseline::new(gpu, volume, views, Method::KdRestart, u32::MAX, bytes)?;
-    tree.settle(view, source)?;
+    let work = tree.settle(view, source)?;
+    let statistics = report.statistics;
+    let rays = f64::from(statistics.rays.max(1));
+    let told = format!(
+        "ours {:.0} samples, {:.1} nodes, {:.1} entries; octree {:.0} samples, {:.1} nodes",
+        statistics.samples as f64 / rays,
+        f64::from(statistics.nodes) / rays,
+        f64::from(statistics.lookups) / rays,
+        work.samples as f64 / work.rays.max(1) as f64,
+        work.mean(),
+    );
     let mut drawn = [
         Drawn::Ours(Box::new(renderer)),
         Drawn::Baseline(Box::new(tree)),
@@ -280,7 +293,7 @@ fn both(
             times.push(drawn.frame_ms(view)?);
         }
     }
-    Ok(times)
+    Ok((times, told))
 }
 
 /// Entries read per ray of a frame: fewest, mean, most.
