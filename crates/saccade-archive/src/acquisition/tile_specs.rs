@@ -18,7 +18,8 @@ use crate::storage::read_regular;
 pub struct TileSpec {
     /// Its id.
     pub id: String,
-    /// Its full-size image: a path, without the scheme of a file URL; of several channels, the one that is shown by default.
+    /// Its full-size image: a path, without the scheme of a file URL but percent-encoded as that is; of several channels, the
+    /// one that is shown by default.
     pub file: String,
     /// Its images of several channels, if it has such.
     pub channels: Vec<ChannelImage>,

@@ -3,6 +3,7 @@
 
 use std::fs;
 use std::future::Future;
+use std::io;
 use std::path::Path;
 use std::time::{Duration, SystemTime};
 
@@ -420,9 +421,13 @@ fn build(
         ImageError::Incomplete { .. } => Refusal::Incomplete(e.to_string()),
         // Of a file that is just being written, the head may be half there.
         ImageError::Broken { .. } | ImageError::TooLarge { .. } => Refusal::Broken(e.to_string()),
-        ImageError::Read { ref source, .. } => Refusal::Incomplete(
-            no_folder::why_on_the_way(path).unwrap_or_else(|| format!("{e}: {source}")),
-        ),
+        ImageError::Read { ref source, .. } => {
+            let blocked = match source.kind() {
+                io::ErrorKind::NotADirectory => no_folder::why_on_the_way(path),
+                _ => None,
+            };
+            Refusal::Incomplete(blocked.unwrap_or_else(|| format!("{e}: {source}")))
+        }
         // Who has neither volume.json nor records has options.
         ImageError::Depth { bits, volume } if watched => Refusal::Never(format!(
             "the image has {bits} bits per sample, but the volume has {volume}; convert it to {volume} bit grey, or \
