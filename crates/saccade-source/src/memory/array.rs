@@ -1,5 +1,5 @@
-use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
+use std::collections::{HashMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 
 use glam::UVec3;
 use saccade_core::volume::Volume;
@@ -20,11 +20,17 @@ const KEPT: usize = 4096;
 /// smallest.
 pub struct ArraySource {
     volume: Arc<Volume>,
-    /// Per level `[c, z, y, x]`.
-    levels: RwLock<Vec<Vec<u8>>>,
+    held: RwLock<Held>,
     changes: Arc<Changes>,
     /// The newest changes.
     log: Mutex<VecDeque<Change>>,
+}
+
+struct Held {
+    /// Per level `[c, z, y, x]`.
+    levels: Vec<Vec<u8>>,
+    /// Of all chunks that have a measured value. Kept, since who draws asks for many at once.
+    ranges: HashMap<ChunkId, ValueRange>,
 }
 
 /// An array whose size is not that of the volume.
@@ -70,7 +76,10 @@ impl ArraySource {
         let source = Self {
             changes: Changes::new(whole, 0),
             log: Mutex::default(),
-            levels: RwLock::new(levels),
+            held: RwLock::new(Held {
+                levels,
+                ranges: HashMap::new(),
+            }),
             volume,
         };
         source.average(whole);
@@ -93,7 +102,7 @@ impl ArraySource {
             });
         }
         {
-            let mut levels = self.levels.write().unwrap_or_else(PoisonError::into_inner);
+            let levels = &mut self.write().levels;
             for (voxel, value) in voxels.iter().zip(values) {
                 let at = index(self.volume.extent(), 0, voxel);
                 levels[0][at] = *value;
@@ -119,10 +128,11 @@ impl ArraySource {
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Brings the coarser levels and the ranges up to date with voxels of the finest.
     fn average(&self, level0: VoxelBox) {
         let extent = self.volume.extent();
-        let mut levels = self.levels.write().unwrap_or_else(PoisonError::into_inner);
-        let (finest, others) = levels.split_first_mut().expect("a volume has a level");
+        let mut held = self.write();
+        let (finest, others) = (held.levels.split_first_mut()).expect("a volume has a level");
         for (level, values) in self.volume.levels[1..].iter().zip(others) {
             for channel in 0..self.volume.channels.len() {
                 for voxel in level.box_from_voxels(level0).iter() {
@@ -133,14 +143,58 @@ impl ArraySource {
                 }
             }
         }
+        let Held { levels, ranges } = &mut *held;
+        let channels = (0..).zip(&self.volume.channels);
+        for (channel, _) in channels {
+            for ((number, level), values) in (0..).zip(&self.volume.levels).zip(&*levels) {
+                let voxels = level.box_from_voxels(level0);
+                let (first, end) = (voxels.min, voxels.max + (self.volume.chunk - 1));
+                let chunks = VoxelBox::new(first / self.volume.chunk, end / self.volume.chunk);
+                for chunk in chunks.iter() {
+                    let id = ChunkId {
+                        channel,
+                        level: number,
+                        chunk,
+                    };
+                    match self.range_of(id, values) {
+                        Some(range) => ranges.insert(id, range),
+                        None => ranges.remove(&id),
+                    };
+                }
+            }
+        }
     }
 
-    fn levels(&self) -> RwLockReadGuard<'_, Vec<Vec<u8>>> {
-        self.levels.read().unwrap_or_else(PoisonError::into_inner)
+    /// Bounds of the measured values of a chunk, among all of its level.
+    fn range_of(&self, id: ChunkId, values: &[u8]) -> Option<ValueRange> {
+        let VoxelBox { min, max } = id.voxels(&self.volume)?;
+        let extent = self.volume.levels[id.level as usize].extent;
+        let rows = (min.z..max.z).flat_map(|z| (min.y..max.y).map(move |y| (y, z)));
+        let (mut least, mut most) = (u8::MAX, 0);
+        for (y, z) in rows {
+            let first = index(extent, id.channel as usize, UVec3::new(min.x, y, z));
+            for &value in &values[first..first + (max.x - min.x) as usize] {
+                // Nothing, which is 0, is the largest once one is taken away.
+                least = least.min(value.wrapping_sub(1));
+                most = most.max(value);
+            }
+        }
+        (most > 0).then(|| ValueRange {
+            min: u16::from(least) + 1,
+            max: u16::from(most),
+        })
+    }
+
+    fn held(&self) -> RwLockReadGuard<'_, Held> {
+        self.held.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn write(&self) -> RwLockWriteGuard<'_, Held> {
+        self.held.write().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn chunk(&self, id: ChunkId) -> Result<Chunk, ChunkError> {
-        let levels = self.levels();
+        let levels = &self.held().levels;
         build_chunk(&self.volume, id, |start, row| {
             let extent = self.volume.levels[id.level as usize].extent;
             let at = index(extent, id.channel as usize, start);
@@ -183,18 +237,6 @@ impl VolumeSource for ArraySource {
     }
 
     fn value_range(&self, id: ChunkId) -> Option<ValueRange> {
-        let voxels = id.voxels(&self.volume)?;
-        let extent = self.volume.levels[id.level as usize].extent;
-        let levels = self.levels();
-        let values = &levels[id.level as usize];
-        let measured = || {
-            let all = voxels.iter();
-            let all = all.map(|v| u16::from(values[index(extent, id.channel as usize, v)]));
-            all.filter(|v| *v != 0)
-        };
-        Some(ValueRange {
-            min: measured().min()?,
-            max: measured().max()?,
-        })
+        self.held().ranges.get(&id).copied()
     }
 }
