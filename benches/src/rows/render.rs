@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use crate::clock::Stopwatch;
 use anyhow::{Result, ensure};
-use glam::{UVec2, UVec3};
+use glam::{DVec3, UVec2, UVec3};
 use saccade_core::camera::Camera;
 use saccade_core::phantom::Phantom;
 use saccade_core::volume::Volume;
@@ -63,6 +63,28 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
         .setting("transfer function", "automatic")
         .setting("data", "all resident");
     Ok(vec![row])
+}
+
+/// A ball of tissue, which looks alike from everywhere.
+pub(super) fn ball() -> Result<ArraySource> {
+    const EDGE: u32 = 288;
+    const RADIUS: f64 = 140.0;
+    let voxel_nm = DVec3::splat(16.0);
+    let volume = Volume::new(NAME, UVec3::splat(EDGE), voxel_nm)?;
+    let phantom = Phantom::new(1, voxel_nm)?;
+    let mut sampler = phantom.sampler();
+    let mut voxels = vec![0; UVec3::splat(EDGE).as_usizevec3().element_product()];
+    for (row, values) in (0..).zip(voxels.chunks_exact_mut(EDGE as usize)) {
+        let (y, z) = (row % EDGE, row / EDGE);
+        sampler.row(0, y, z, values);
+        for (x, value) in (0..).zip(values) {
+            let from_middle = UVec3::new(x, y, z).as_dvec3() + 0.5 - f64::from(EDGE) / 2.0;
+            if from_middle.length() > RADIUS {
+                *value = 0;
+            }
+        }
+    }
+    Ok(ArraySource::new(volume, voxels)?)
 }
 
 /// A piece of tissue.

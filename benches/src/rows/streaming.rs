@@ -55,7 +55,8 @@ struct Frame {
     drawing: f64,
     /// Since the one before \[ms\].
     apart: f64,
-    /// The same where a GPU draws; where processors do, what all threads had of them, which others disturb less \[ms\].
+    /// The same where a GPU draws; where processors do, what all threads had of them, which others disturb less; a part of it for each frame that
+    /// was finished \[ms\].
     work: f64,
     /// Processor time of the drawing thread in the meantime \[ms\].
     thread: f64,
@@ -73,7 +74,7 @@ impl Turn {
     ) -> Result<Self> {
         let mut turn = Self::default();
         let by_processors = table_9_1::is_cpu(session.renderer().gpu());
-        let mut finished = (None, None);
+        let mut finished = (0, None);
         let mut threads_before = cpu::of_threads()?;
         let mut spent = Duration::ZERO;
         // Of the drawing thread and of bricks, since a frame was finished.
@@ -93,27 +94,27 @@ impl Turn {
             bricks_since += status.delivered - before - turn.bricks;
             turn.bricks = status.delivered - before;
             let now = start.elapsed();
-            // Two frames hardly take as long to the nanosecond.
-            if let Some(time) = status
-                .frame_time
-                .filter(|_| status.frame_time != finished.0)
-            {
+            let known = status.frame_known;
+            if let Some(time) = status.frame_time.filter(|_| known > finished.0) {
+                // Frames that are seen to be finished at once share the time.
+                let frames = (known - finished.0) as f64;
                 let threads = cpu::of_threads()?;
                 let of_threads = threads.saturating_sub(threads_before);
                 threads_before = threads;
                 if let Some(last) = finished.1.replace(now) {
                     let apart = now.saturating_sub(last);
+                    let work = milliseconds(if by_processors { of_threads } else { apart });
                     turn.frames.push(Frame {
                         turned: DEGREES_PER_S * now.saturating_sub(time).as_secs_f64(),
                         drawing: milliseconds(time),
                         apart: milliseconds(apart),
-                        work: milliseconds(if by_processors { of_threads } else { apart }),
+                        work: work / frames,
                         thread: milliseconds(thread_since),
                         bricks: bricks_since,
                         samples: status.statistics.samples,
                     });
                 }
-                finished.0 = status.frame_time;
+                finished.0 = known;
                 (thread_since, bricks_since) = (Duration::ZERO, 0);
             }
             tokio::time::sleep(Duration::from_micros(500)).await;
@@ -193,58 +194,57 @@ fn told(values: &[f64]) -> String {
 pub(crate) fn streaming(settings: &Settings) -> Result<Vec<Row>> {
     const RUNS: usize = 3;
     let runtime = runtime()?;
-    let source = Arc::new(render::source()?);
+    let source = Arc::new(render::ball()?);
     let volume = Volume::clone(source.volume());
-    let camera = Camera::around(&volume).zoomed(2.5);
+    let camera = Camera::around(&volume);
     let mut runs = [const { Vec::new() }; 3];
     // What is said of each run, of the first row and of the third.
     let mut told_of = [const { Vec::new() }; 2];
     let mut picture = UVec2::ZERO;
     for run in 1..=RUNS {
-        // So little memory that what was seen is gone when it is seen again; and so much that all stays.
-        let mut turns = Vec::new();
-        for (name, gpu_bytes) in [("streaming", 12 << 20), ("all resident", 512 << 20)] {
-            let (turn, size) = runtime.block_on(async {
-                let gpu = Gpu::headless().await?;
-                let (size, length) = match settings.scale(&gpu) {
-                    Scale::Small => (UVec2::new(160, 120), 12),
-                    Scale::Medium => (UVec2::new(400, 300), 24),
-                    Scale::Paper => (UVec2::new(1024, 768), 12),
-                };
-                let length = Duration::from_secs(length);
-                let options = SessionOptions {
-                    gpu_bytes,
-                    ..SessionOptions::default()
-                };
-                let mut session = Session::new(&gpu, source.clone(), options)?;
-                // Pipelines are compiled, the histogram is known; and once around, so is what can be.
-                session
-                    .settle(&view_of(camera, size), Duration::from_secs(600))
-                    .await?;
-                Turn::around(&mut session, camera, size, length).await?;
-                let turn = Turn::around(&mut session, camera, size, length).await?;
-                anyhow::Ok((turn, size))
-            })?;
+        let (turns, size) = runtime.block_on(async {
+            let gpu = Gpu::headless().await?;
+            let (size, length) = match settings.scale(&gpu) {
+                Scale::Small => (UVec2::new(160, 120), 12),
+                Scale::Medium => (UVec2::new(400, 300), 24),
+                Scale::Paper => (UVec2::new(1024, 768), 12),
+            };
+            let length = Duration::from_secs(length);
+            let mut session = Session::new(&gpu, source.clone(), SessionOptions::default())?;
+            // Pipelines are compiled, the histogram is known.
+            let first = view_of(camera, size);
+            session.settle(&first, Duration::from_secs(600)).await?;
+            // The other sides arrive while they are turned to, and are there the second time.
+            let streaming = Turn::around(&mut session, camera, size, length).await?;
+            session.settle(&first, Duration::from_secs(600)).await?;
+            let resident = Turn::around(&mut session, camera, size, length).await?;
+            anyhow::Ok(([streaming, resident], size))
+        })?;
+        for (turn, name) in turns.iter().zip(["streaming", "all resident"]) {
             ensure!(turn.frames.len() > 10, "hardly a frame was drawn");
             let apart = turn.each(|frame| frame.apart);
             let text = format!(
-                "{} frames, {} bricks arrived; ms, median / 99 % / worst: apart {}, drawing {}, drawing thread {}",
+                "{} frames, {} bricks arrived; ms, median / 99 % / worst: of processors {}, apart {}, drawing {}, drawing thread {}",
                 turn.frames.len(),
                 turn.bricks,
+                told(&turn.each(|frame| frame.work)),
                 told(&apart),
                 told(&turn.each(|frame| frame.drawing)),
                 told(&turn.thread),
             );
             eprintln!("  {name}: {text}");
             told_of[0].push((format!("run {run}, {name}"), text));
-            turns.push(turn);
-            picture = size;
         }
-        let [streaming, resident] = &turns[..] else {
-            unreachable!("a turn with little memory and one with much");
-        };
-        let [median, _, worst] = spread(&streaming.each(|frame| frame.apart));
+        picture = size;
+        let [streaming, resident] = &turns;
+        ensure!(streaming.bricks > 50, "hardly a brick arrived");
+        let [median, _, worst] = spread(&streaming.each(|frame| frame.work));
         runs[0].push(worst / median);
+        let [median, _, worst] = spread(&resident.each(|frame| frame.work));
+        eprintln!(
+            "  everything there: slowest {:.2} times the median",
+            worst / median
+        );
         runs[1].push(spread(&streaming.thread)[2]);
         let (ratio, text) = { streaming.longest_beside(resident) }.context("nothing to compare")?;
         eprintln!("  longest, {ratio:.2} times: {text}");
@@ -261,14 +261,15 @@ pub(crate) fn streaming(settings: &Settings) -> Result<Vec<Row>> {
     let with = |row: Row, told: Vec<(String, String)>| {
         { told.into_iter() }.fold(row, |row, (name, text)| row.setting(&name, text))
     };
-    let unit = "slowest over the median, of the time between frames";
+    let time = "between frames; of all threads' processors where these draw";
+    let unit = "slowest frame over the median one";
     let ratio = Row::new(STREAMING_IDS[0], unit, ratios)
         .setting("picture", format!("{}x{}", picture.x, picture.y))
-        .setting("data", "512 x 512 x 48 voxels of tissue in 12 MB of GPU memory, of the finest level, a camera that turns 30 degrees a second");
+        .setting("data", "a ball of tissue, 280 voxels wide, of the finest level, a camera that turns 30 degrees a second and has not been there")
+        .setting("time", time);
     let unit = "ms of the drawing thread for a frame and what arrived, longest";
     let thread = Row::new(STREAMING_IDS[1], unit, threads);
     let unit = "longest over frames of the same part of the turn with everything there";
-    let time = "between frames; of all threads' processors where these draw";
     let beside = Row::new(STREAMING_IDS[2], unit, beside).setting("time", time);
     Ok(vec![with(ratio, of_turns), thread, with(beside, of_latest)])
 }

@@ -26,6 +26,8 @@ pub struct Status {
     pub frame: u64,
     /// Whether this call drew one.
     pub drew: bool,
+    /// Number of the newest frame known about, as `frame` counts; 0 before the first.
+    pub frame_known: u64,
     /// Whether the last frame drawn is known to hold everything it wanted, up to date.
     pub complete: bool,
     /// Whether nothing will change by itself: no data on the way, no frame being drawn. An
@@ -104,6 +106,7 @@ impl Session {
         Status {
             frame: self.drawn,
             drew,
+            frame_known: report.map_or(0, |report| report.frame),
             complete: known && report.is_some_and(FrameReport::is_complete),
             settled: (known && idle && self.refresh.due().is_none()) || self.too_large.is_some(),
             fidelity: report.map(|r| r.fidelity).unwrap_or_default(),
