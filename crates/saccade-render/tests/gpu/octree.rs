@@ -400,7 +400,10 @@ fn what_is_hidden_behind_much_that_is_seen_is_not_asked_for() {
         }
     }
     assert!(frame(&mut renderer, &view).is_complete());
-    assert!(behind && !noted.is_empty(), "rays end before they come that far");
+    assert!(
+        behind && !noted.is_empty(),
+        "rays end before they come that far"
+    );
 }
 
 /// That all values are seen does not say that there is something everywhere.
