@@ -278,6 +278,7 @@ mod tests {
         Status {
             frame: 7,
             drew: false,
+            frame_known: 7,
             complete: true,
             settled: true,
             fidelity: Bricks {
