@@ -407,6 +407,12 @@ impl<F: Folders> ListWatch<F> {
                 // The list has it, or was not read yet.
                 Some(Image::Told) | None => {
                     let is_it = told.as_ref().is_some_and(|told| told.file == file);
+                    let fits_better = |(told, wanted): (&Told, &Wanted)| {
+                        self.index.fits_better(file, &told.file, &wanted.file)
+                    };
+                    if told.as_ref().zip(wanted.as_ref()).is_some_and(fits_better) {
+                        self.look_for(&name, now);
+                    }
                     of_it.extend(is_it.then_some(name));
                 }
             }

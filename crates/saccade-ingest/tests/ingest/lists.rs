@@ -3,6 +3,7 @@
 mod channels;
 mod encoded;
 mod growing;
+mod late;
 mod power_cuts;
 mod refused;
 mod registration;

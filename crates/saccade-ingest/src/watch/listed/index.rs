@@ -3,7 +3,7 @@
 //! A look asks so many folders and entries, lists only folders that changed since they were last listed, and goes on
 //! where the last one stopped. Sixteen bytes are kept per file.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
@@ -49,6 +49,9 @@ pub(super) struct Index {
     several: HashMap<u64, BTreeSet<usize>>,
     /// Files that may be projects of TrakEM2, below the root.
     projects: BTreeSet<PathBuf>,
+    /// How many images that the list names end in a name, or in a name with folders before it, by the hash of that. With folders
+    /// only where several have the name.
+    listed: HashMap<u64, u32>,
     /// What was looked for and is nothing to read, below the root.
     odd: BTreeSet<PathBuf>,
     /// Which of them was looked at again last.
@@ -85,6 +88,14 @@ fn oddity(path: &Path) -> Option<&'static str> {
     }
 }
 
+/// A path's last part and so many folders before it, however they are separated; `None` if there are not so many.
+fn tail(file: &str, folders: usize) -> Option<String> {
+    let parts = file.rsplit(['/', '\\']);
+    let parts = parts.filter(|part| !matches!(*part, "" | "."));
+    let parts: Vec<_> = parts.take(folders + 1).collect();
+    (parts.len() > folders).then(|| parts.join("/"))
+}
+
 /// How many folders two paths have in common from their ends on.
 fn likeness(path: &Path, file: &str) -> usize {
     let folders = path.components().rev().skip(1);
@@ -118,6 +129,7 @@ impl Index {
             files: HashMap::new(),
             several: HashMap::new(),
             projects: BTreeSet::new(),
+            listed: HashMap::new(),
             odd: BTreeSet::new(),
             odd_at: PathBuf::new(),
             changed: false,
@@ -134,12 +146,64 @@ impl Index {
         self.projects.iter().map(PathBuf::as_path)
     }
 
+    /// Takes over which images a list names.
+    pub(super) fn know<'a>(&mut self, files: impl Iterator<Item = &'a str>) {
+        // Folders in common beyond these are not told apart.
+        const MOST_FOLDERS: usize = 8;
+        let spellings = |file: &str| [Some(file.to_owned()), decoded(file)].into_iter().flatten();
+        let mut known = HashSet::new();
+        let mut is_new =
+            |file: &&str| known.insert(key(&decoded(file).unwrap_or((*file).to_owned())));
+        let files: Vec<&str> = files.filter(&mut is_new).collect();
+        self.listed.clear();
+        for file in &files {
+            let names: BTreeSet<u64> = spellings(file).map(|file| key(base(&file))).collect();
+            for name in names {
+                *self.listed.entry(name).or_default() += 1;
+            }
+        }
+        let names = self.listed.iter().filter(|(_, count)| **count > 1);
+        let shared: HashSet<u64> = names.map(|(name, _)| *name).collect();
+        let is_shared = |file: &str| shared.contains(&key(base(file)));
+        for file in &files {
+            let mut tails = BTreeSet::new();
+            for spelling in spellings(file).filter(|file| is_shared(file)) {
+                let of = (1..=MOST_FOLDERS).map_while(|folders| tail(&spelling, folders));
+                tails.extend(of.map(|tail| key(&tail)));
+            }
+            for tail in tails {
+                *self.listed.entry(tail).or_default() += 1;
+            }
+        }
+    }
+
+    /// Whether an image that lies elsewhere may be what a list calls `file`: not, if it is as much like another one that the
+    /// list names, or more.
+    fn may_be(&self, path: &Path, file: &str) -> bool {
+        let tail = tail(file, likeness(path, file));
+        let count = tail.and_then(|tail| self.listed.get(&key(&tail)).copied());
+        count.unwrap_or(0) <= 1
+    }
+
+    /// The image at the path that a list calls `file`.
+    fn exactly(&self, file: &str) -> Option<PathBuf> {
+        let named = image_path(Path::new(""), file)?;
+        let is_there = self.root.join(&named).is_file();
+        is_there.then(|| named.components().collect())
+    }
+
     /// The image that a list calls `file`: at that path, else by name alone. Of several of that name the one whose
-    /// folders are most like those that the list names; none, if that could be several. If there is none, the same of what
-    /// `file` means [`decoded`].
+    /// folders are most like those that the list names; none, if that could be several, or if it is as much like another one that the
+    /// list names. If there is none, the same of what `file` means [`decoded`].
     pub(super) fn sought(&self, file: &str) -> Sought {
+        let meant = decoded(file);
+        let exact = self.exactly(file);
+        let exact = exact.or_else(|| self.exactly(meant.as_ref()?));
+        if let Some(path) = exact.as_ref().and_then(|path| path.to_str()) {
+            return Sought::There(path.to_owned());
+        }
         let as_written = self.sought_as(file);
-        let Some(decoded) = decoded(file) else {
+        let Some(decoded) = meant else {
             return as_written;
         };
         match as_written {
@@ -159,18 +223,11 @@ impl Index {
             Some(path) => Sought::There(path.to_owned()),
             None => Sought::Missing,
         };
-        let named = image_path(Path::new(""), file);
-        if let Some(named) = named.filter(|path| self.root.join(path).is_file()) {
-            let plain: PathBuf = named.components().collect();
-            return there(&plain);
+        if let Some(path) = self.exactly(file) {
+            return there(&path);
         }
-        let (name, hash) = (base(file), key(base(file)));
-        let Some(first) = self.files.get(&hash) else {
-            return Sought::Missing;
-        };
-        let one = BTreeSet::from([*first]);
-        let folders = self.several.get(&hash).unwrap_or(&one).iter();
-        let paths = folders.map(|folder| self.folders[*folder].path.join(name));
+        let paths = self.called(base(file));
+        let paths = paths.filter(|path| self.may_be(path, file));
         let paths = paths.filter(|path| self.root.join(path).is_file());
         let mut paths: Vec<(usize, PathBuf)> =
             paths.map(|path| (likeness(&path, file), path)).collect();
@@ -184,12 +241,27 @@ impl Index {
         }
     }
 
+    /// Where files of a name were seen, below the root.
+    fn called(&self, name: &str) -> impl Iterator<Item = PathBuf> {
+        let hash = key(name);
+        let (first, several) = (self.files.get(&hash), self.several.get(&hash));
+        let folders = several.into_iter().flatten();
+        let folders = folders.chain(first.filter(|_| several.is_none()));
+        folders.map(move |folder| self.folders[*folder].path.join(name))
+    }
+
     /// The same; what is not where it was is looked for anew.
     pub(super) fn find(&mut self, file: &str) -> Sought {
         let found = self.sought(file);
         if found == Sought::Missing {
             for name in names(file) {
-                self.forget(&name);
+                // Those that are there may be others that the list names.
+                if !self
+                    .called(&name)
+                    .any(|path| self.root.join(path).is_file())
+                {
+                    self.forget(&name);
+                }
             }
         }
         found
@@ -211,9 +283,37 @@ impl Index {
         }
     }
 
-    /// Whether the image that was found is the one that a list calls `file`: as long as it has that name, and there is
-    /// none at that path; or the name that is meant, and there is none of the one that is written.
+    /// Whether an image that has come fits what a list calls `file` better than the one that was found.
+    pub(super) fn fits_better(&self, come: &str, found: &str, file: &str) -> bool {
+        let fit = |path: &str| {
+            let like = |file: &str| likeness(Path::new(path), file);
+            let as_meant = decoded(file).map_or(0, |meant| like(&meant));
+            (like(file).max(as_meant), base(path) == base(file))
+        };
+        // The file system is asked of few.
+        come != found
+            && fit(come) > fit(found)
+            && self.sought(file) == Sought::There(come.to_owned())
+    }
+
+    /// Whether the image that was found is the one that a list calls `file`: as long as it is called so, none fits better, and
+    /// it does not fit another one as well.
     pub(super) fn is_still(&self, found: &str, file: &str) -> bool {
+        let is_anothers = || {
+            let found = Path::new(found);
+            let meant = decoded(file);
+            !self.may_be(found, file) && meant.is_none_or(|meant| !self.may_be(found, &meant))
+        };
+        self.is_called(found, file)
+            && match self.sought(file) {
+                Sought::There(path) => !self.fits_better(&path, found, file),
+                Sought::Several(_) | Sought::Missing => !is_anothers(),
+            }
+    }
+
+    /// Whether an image has the name of what a list calls `file`, and there is none at that path; or the name that is meant, and there
+    /// is none of the one that is written.
+    fn is_called(&self, found: &str, file: &str) -> bool {
         let another_at = |file: &str| {
             let named = image_path(Path::new(""), file);
             let named = named.map(|path| path.components().collect::<PathBuf>());
@@ -458,6 +558,47 @@ mod tests {
         assert_eq!(index.find("a.tif"), Sought::Missing);
         round(&mut index);
         assert_eq!(index.find("a.tif"), there("new/a.tif"));
+    }
+
+    #[test]
+    fn an_image_that_is_more_like_another_that_is_listed_is_that_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |file: &str| {
+            let path = folder.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        };
+        let mut index = Index::new(folder.path());
+        let round = |index: &mut Index| while index.look(&Disk, 99).unwrap().1 == Next::More {};
+        let there = |path: &str| Sought::There(path.to_owned());
+        let listed = ["/scope/s00/r.tif", "/scope/s01/r.tif", "/scope/s%202/r.tif"];
+        index.know(
+            listed
+                .iter()
+                .copied()
+                .chain(["/scope/s00/r.tif", "/scope/x/one.tif"]),
+        );
+        // Stray ones may be any of them, or the only one of a name.
+        for file in ["old/r.tif", "old/one.tif", "s00/r.tif"] {
+            write(file);
+        }
+        round(&mut index);
+        assert_eq!(index.find(listed[0]), there("s00/r.tif"));
+        assert_eq!(index.find(listed[1]), Sought::Missing);
+        assert_eq!(index.find(listed[2]), Sought::Missing);
+        assert_eq!(index.find("/scope/x/one.tif"), there("old/one.tif"));
+        assert!(index.is_still("s00/r.tif", listed[0]));
+        assert!(!index.is_still("s00/r.tif", listed[1]), "it is the other's");
+        for file in ["s01/r.tif", "s 2/r.tif", "x/one.tif"] {
+            write(file);
+        }
+        round(&mut index);
+        assert_eq!(index.find(listed[1]), there("s01/r.tif"));
+        assert_eq!(index.find(listed[2]), there("s 2/r.tif"));
+        // What fits better takes its place.
+        assert!(index.fits_better("x/one.tif", "old/one.tif", "/scope/x/one.tif"));
+        assert!(!index.is_still("old/one.tif", "/scope/x/one.tif"));
+        assert!(!index.fits_better("old/one.tif", "x/one.tif", "/scope/x/one.tif"));
     }
 
     #[test]

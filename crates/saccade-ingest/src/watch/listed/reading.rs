@@ -278,6 +278,8 @@ impl<F: Folders> ListWatch<F> {
         let Some(frame) = self.frame.clone() else {
             return;
         };
+        self.index
+            .know(listing.tiles.iter().map(|tile| &*tile.file));
         for tile in self.tiles.values_mut() {
             tile.wanted = None;
         }
