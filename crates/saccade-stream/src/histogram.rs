@@ -1,6 +1,6 @@
 //! What values a volume has, from a few of its chunks.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 
 use futures::StreamExt;
 use saccade_core::levels::Level;
@@ -14,6 +14,10 @@ use crate::policy::Retry;
 
 /// Chunks read of the coarsest level, to find where data are.
 const COARSE_CHUNKS: usize = 8;
+/// Where all of these are empty, so many times as many, and again.
+const MORE_CHUNKS: usize = 8;
+/// Chunks read of the coarsest level at most.
+const MOST_CHUNKS: usize = 512;
 /// Finer levels are searched where they have so many chunks at most.
 const SEARCHED_CHUNKS: u64 = 4096;
 /// Chunks counted.
@@ -54,10 +58,17 @@ pub async fn sample(source: &dyn VolumeSource, channel: u32, retry: Retry) -> Sa
             break;
         }
         let all: BTreeSet<Ordered> = chunks.iter().map(|chunk| ordered(level, chunk)).collect();
-        let chosen = spread(channel, &all, COARSE_CHUNKS);
-        let (read, failed) = read(source, retry, chosen, &mut result.partial).await;
-        for (id, chunk) in read {
-            places.extend(places_with_data(volume, id, &chunk, counted));
+        let mut looked_at = HashSet::new();
+        let (mut most, mut failed) = (COARSE_CHUNKS, 0);
+        while places.is_empty() && failed == 0 && most <= MOST_CHUNKS {
+            let chosen = spread(channel, &all, most).into_iter();
+            let chosen = chosen.filter(|id| looked_at.insert(*id)).collect();
+            let read = read(source, retry, chosen, &mut result.partial).await;
+            failed = read.1;
+            for (id, chunk) in read.0 {
+                places.extend(places_with_data(volume, id, &chunk, counted));
+            }
+            most *= MORE_CHUNKS;
         }
         if !places.is_empty() || failed == 0 {
             break;
@@ -257,6 +268,30 @@ mod tests {
     #[test]
     fn nothing_acquired_gives_an_empty_histogram() {
         assert_eq!(take(&source(UVec3::splat(40), |_| 0)).histogram.total(), 0);
+    }
+
+    /// The coarsest level is large where there is but one.
+    #[test]
+    fn data_that_the_first_chunks_miss_are_found() {
+        let extent = UVec3::splat(192);
+        let block = |at: UVec3| {
+            u8::from(at.cmpge(UVec3::splat(100)).all() && at.cmplt(UVec3::splat(120)).all())
+        };
+        let levels = source(UVec3::splat(8), |_| 0).volume().levels[..1].to_vec();
+        let volume = Volume {
+            chunk: UVec3::new(32, 32, 16),
+            levels: vec![Level {
+                extent,
+                ..levels[0]
+            }],
+            ..Volume::new("v", extent, DVec3::ONE).unwrap()
+        };
+        let voxels = VoxelBox::of_size(extent)
+            .iter()
+            .map(|at| 90 * block(at))
+            .collect();
+        let source = ArraySource::new(volume, voxels).unwrap();
+        assert_eq!(take(&source).histogram.counts()[90], 8000);
     }
 
     #[test]
