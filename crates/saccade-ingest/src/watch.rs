@@ -43,6 +43,7 @@ mod list;
 mod listed;
 mod looking;
 pub(crate) mod no_folder;
+mod no_image;
 mod pattern;
 mod scan;
 mod stamp;
@@ -152,6 +153,10 @@ pub struct Watch<F> {
     tells_misfits: bool,
     /// Where folders should be and others lie, as it was said last.
     blocked: Vec<String>,
+    /// Why images cannot be looked at, as it was said last, and of how many more it was not said.
+    lost: (Vec<String>, usize),
+    /// Whether each of them is told as it is met.
+    tells_lost: bool,
     held_up: HeldUp,
 }
 
@@ -293,6 +298,8 @@ impl<F: Folders> Watch<F> {
             seen: false,
             tells_misfits: false,
             blocked: Vec::new(),
+            lost: (Vec::new(), 0),
+            tells_lost: false,
             held_up: HeldUp::default(),
         };
         watch.take_over()?;
@@ -354,6 +361,19 @@ impl<F: Folders> Watch<F> {
         }
         self.list = Some(list);
         Ok(true)
+    }
+
+    /// Which images cannot be looked at though their names are there, in words.
+    pub fn missing(&self) -> Option<String> {
+        const SHOWN: usize = 3;
+        let (whys, more) = &self.lost;
+        let first = whys.iter().take(SHOWN).cloned();
+        let more = match whys.len().saturating_sub(SHOWN) + more {
+            0 => None,
+            more => Some(format!("and {more} more such images")),
+        };
+        let said: Vec<_> = first.chain(more).collect();
+        (!said.is_empty()).then(|| said.join("; "))
     }
 
     /// Why nothing is taken in: once the folder was gone through, and something is there, but no file whose name
@@ -491,6 +511,7 @@ pub fn run<F: Folders>(
 ) -> Result<u64, WatchError> {
     // Who looks once is told by the caller.
     watch.tells_misfits = !once;
+    watch.tells_lost = !once;
     look_on(watch, once, cancel, |_| false)
 }
 
@@ -513,6 +534,12 @@ impl<F: Folders> Looks for Watch<F> {
             log::warn!("{why}");
         }
         self.blocked = blocked;
+        let lost = self.scanner.lost();
+        let is_new = |why: &&String| !self.lost.0.contains(why);
+        for why in { lost.0.iter() }.filter(is_new).filter(|_| self.tells_lost) {
+            log::warn!("{why}");
+        }
+        self.lost = lost;
         looked
     }
 
@@ -527,6 +554,7 @@ impl<F: Folders> Looks for Watch<F> {
     fn waits_for(&self) -> Option<String> {
         let said: Vec<_> = { self.unmatched().into_iter() }
             .chain(self.blocked.iter().cloned())
+            .chain(self.missing())
             .collect();
         (!said.is_empty()).then(|| said.join("; "))
     }

@@ -1,9 +1,10 @@
 //! Which files are new, found with few questions to the file system.
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
+use std::ops::Bound;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -11,7 +12,7 @@ use saccade_archive::clock::{Clock as _, SystemClock};
 
 use super::again::Again;
 use super::stamp::Seen;
-use super::{Pattern, Place, Stamp, no_folder};
+use super::{Pattern, Place, Stamp, no_folder, no_image};
 
 /// What a folder holds.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -127,6 +128,16 @@ const SETTLED: Duration = Duration::from_secs(3);
 /// Of what lies where folders should be, the first so many are told: they are asked for at each look.
 const MOST_BLOCKED: usize = 16;
 
+/// Of images that cannot be looked at, so many are told, and so many are asked for per look.
+const MOST_LOST: usize = 16;
+const LOST_PER_LOOK: usize = 64;
+
+/// An image that cannot be looked at though its name is there.
+struct Lost {
+    place: Place,
+    since: SystemTime,
+}
+
 struct Known {
     /// Below the watched folder; empty for itself.
     path: PathBuf,
@@ -173,6 +184,11 @@ pub struct Scanner<F> {
     closed: HashMap<usize, io::ErrorKind>,
     /// What lies where folders should be, below the watched folder.
     blocked: BTreeSet<PathBuf>,
+    /// Images that cannot be looked at, such as links to nothing, below the watched folder: what they lead to comes
+    /// without a change of their folders.
+    lost: BTreeMap<PathBuf, Lost>,
+    /// The last of them that was asked for.
+    lost_at: PathBuf,
     /// When the last of them was told of.
     told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
@@ -207,6 +223,8 @@ impl<F: Folders> Scanner<F> {
             went_round: false,
             closed: HashMap::new(),
             blocked: BTreeSet::new(),
+            lost: BTreeMap::new(),
+            lost_at: PathBuf::new(),
             told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
             counts: Counts::default(),
@@ -239,6 +257,45 @@ impl<F: Folders> Scanner<F> {
             is_blocked
         });
         said
+    }
+
+    /// Why images whose names fit cannot be looked at: of the first ones, and how many more there are.
+    pub(super) fn lost(&self) -> (Vec<String>, usize) {
+        let first = self.lost.keys().take(MOST_LOST);
+        let said = first.filter_map(|path| no_image::why(&self.root.join(path)));
+        let more = self.lost.len().saturating_sub(MOST_LOST);
+        (said.collect(), more)
+    }
+
+    /// Looks again at some of those.
+    fn look_at_lost(&mut self, found: &mut Vec<Found>) {
+        let after = (Bound::Excluded(self.lost_at.clone()), Bound::Unbounded);
+        let some = self.lost.range(after).take(LOST_PER_LOOK);
+        let some: Vec<_> = some.map(|(path, _)| path.clone()).collect();
+        self.lost_at = match some.last() {
+            Some(last) if some.len() == LOST_PER_LOOK => last.clone(),
+            _ => PathBuf::new(),
+        };
+        for path in some {
+            let whole = self.root.join(&path);
+            let stamp = self.folders.stamp(&whole);
+            if stamp.is_err() && no_image::why(&whole).is_some() {
+                continue;
+            }
+            // Of one that is gone the folder tells when it comes back.
+            let lost = self.lost.remove(&path);
+            if let (Ok(stamp), Some(lost)) = (stamp, lost) {
+                self.meet(&path, lost.place, stamp, found);
+                self.changed = true;
+            }
+        }
+    }
+
+    /// Whether one of them was met only just: what it leads to may be about to come.
+    fn has_lost_just_now(&self) -> bool {
+        let now = self.folders.now();
+        let age = |lost: &Lost| now.duration_since(lost.since);
+        { self.lost.values() }.any(|lost| age(lost).is_ok_and(|age| age < SETTLED))
     }
 
     /// Notes what lies where a folder should be.
@@ -313,6 +370,7 @@ impl<F: Folders> Scanner<F> {
         let mut found = Vec::new();
         let mut left = budget.max(1);
         self.look_again(&mut found, &mut left);
+        self.look_at_lost(&mut found);
         loop {
             if left == 0 {
                 return Ok((found, Next::More));
@@ -328,8 +386,9 @@ impl<F: Folders> Scanner<F> {
             if self.to_ask == 0 {
                 self.to_ask = self.known.len();
                 self.went_round = true;
-                let changed = std::mem::take(&mut self.changed) || self.again.waits();
-                return Ok((found, if changed { Next::Again } else { Next::Rest }));
+                let changed = std::mem::take(&mut self.changed);
+                let waits = changed || self.again.waits() || self.has_lost_just_now();
+                return Ok((found, if waits { Next::Again } else { Next::Rest }));
             }
             self.round.rotate_left(1);
             let Some(&folder) = self.round.back() else {
@@ -441,11 +500,23 @@ impl<F: Folders> Scanner<F> {
         };
         self.counts.fit += 1;
         *left = left.saturating_sub(1);
-        let Ok(stamp) = self.folders.stamp(&self.root.join(&below)) else {
-            // Gone, or not to be seen: the folder is looked through again.
-            listing.modified = None;
-            return;
-        };
+        let whole = self.root.join(&below);
+        match self.folders.stamp(&whole) {
+            Ok(stamp) => {
+                self.lost.remove(&below);
+                self.meet(&below, place, stamp, found);
+            }
+            Err(_) if no_image::why(&whole).is_some() => {
+                let since = self.folders.now();
+                self.lost.entry(below).or_insert(Lost { place, since });
+            }
+            // Gone: the folder is looked through again.
+            Err(_) => listing.modified = None,
+        }
+    }
+
+    /// An image, as it looks now.
+    fn meet(&mut self, below: &Path, place: Place, stamp: Stamp, found: &mut Vec<Found>) {
         // The pattern is text, so the path is.
         let file = below.to_string_lossy().into_owned();
         let (key, seen) = (self.hasher.hash_one(&file), Seen::of(&stamp));

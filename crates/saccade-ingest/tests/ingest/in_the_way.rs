@@ -180,6 +180,78 @@ async fn a_pipe_where_names_say_an_image_is_set_aside() {
     assert_eq!(taken, ["s0_r0_c0", "s0_r0_c1"]);
 }
 
+/// Looks once, and ends.
+fn look_once(beside: &Beside) -> Watch<Disk> {
+    let (sender, ends) = channel();
+    let mut watch = beside.watch();
+    std::thread::spawn(move || {
+        watch::run(&mut watch, true, &Cancel::new()).unwrap();
+        sender.send(watch).unwrap();
+    });
+    ends.recv_timeout(Duration::from_secs(30)).expect("it ends")
+}
+
+/// What a link leads to may never come: who looks once does not wait for it.
+#[test]
+fn links_to_no_image_where_names_say_images_are_told_and_not_waited_for() {
+    let beside = Beside::new();
+    beside.folder("s0", "r0_c0.tif", 1);
+    symlink("image", beside.at("s0/r0_c1.tif")).unwrap();
+    symlink("r0_c2.tif", beside.at("s0/r0_c2.tif")).unwrap();
+    let watch = look_once(&beside);
+    assert_eq!(beside.told(), BTreeSet::from(["s0_r0_c0".to_owned()]));
+    let missing = watch.missing().unwrap();
+    let root = beside.at("").canonicalize().unwrap();
+    for (kind, file) in [
+        ("a link to nothing", "s0/r0_c1.tif"),
+        ("a link that cannot be followed", "s0/r0_c2.tif"),
+    ] {
+        let at = root.join(file).display().to_string();
+        let said = { missing.split("; ") }.any(|said| said.contains(kind));
+        assert!(said && missing.contains(&at), "{missing}");
+    }
+    drop(watch);
+
+    fs::write(beside.at("s0/image"), tiff8(SIZE, &texture(SIZE, 2))).unwrap();
+    fs::remove_file(beside.at("s0/r0_c2.tif")).unwrap();
+    let watch = look_once(&beside);
+    assert_eq!(watch.missing(), None);
+    assert_eq!(beside.told().len(), 2);
+    drop(watch);
+
+    // One that was taken in before.
+    fs::remove_file(beside.at("s0/r0_c0.tif")).unwrap();
+    symlink("none", beside.at("s0/r0_c0.tif")).unwrap();
+    let missing = look_once(&beside).missing().unwrap();
+    assert!(missing.contains("a link to nothing"), "{missing}");
+    assert_eq!(beside.told().len(), 2);
+}
+
+/// Its folder does not change when what the link leads to comes.
+#[test]
+fn what_a_link_in_an_images_place_leads_to_is_told_of_once_it_comes() {
+    let beside = Beside::new();
+    beside.folder("s0", "r0_c0.tif", 1);
+    let elsewhere = beside.0.path().join("elsewhere.tif");
+    symlink(&elsewhere, beside.at("s0/r0_c1.tif")).unwrap();
+    let (cancel, held_up) = (Cancel::new(), HeldUp::default());
+    let _ended = Ended(cancel.clone());
+    let mut watch = beside.watch().telling(held_up.clone());
+    std::thread::spawn(move || watch::run(&mut watch, false, &cancel).unwrap());
+    let why = || held_up.now().into_iter().map(|reason| reason.why).next();
+    let said = until("why", why);
+    assert!(said.starts_with("a link to nothing"), "{said}");
+    // Until its folder's time counts.
+    std::thread::sleep(Duration::from_secs(4));
+    let part = beside.0.path().join("part");
+    fs::write(&part, tiff8(SIZE, &texture(SIZE, 2))).unwrap();
+    fs::rename(part, elsewhere).unwrap();
+    until("the image", || {
+        beside.told().contains("s0_r0_c1").then_some(())
+    });
+    until("nothing to wait for", || why().is_none().then_some(()));
+}
+
 #[test]
 fn what_lies_where_a_list_says_folders_is_told() {
     let beside = Beside::new();

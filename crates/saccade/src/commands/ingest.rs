@@ -215,12 +215,13 @@ impl Ingest {
                     Watch::open(config, Disk, &self.acquisition, kept)?.telling(held_up);
                 shared(watch.leads());
                 let folder = watch.folder().to_owned();
-                let mut watching = None;
+                let (mut watching, mut missing) = (None, None);
                 if once {
                     watch::run(&mut watch, true, &cancel)?;
                     if let Some(why) = watch.unmatched() {
                         anyhow::bail!("{why}; give --pattern as the files are named");
                     }
+                    missing = watch.missing();
                 } else {
                     let looks = move || Ok(watch::run(&mut watch, false, &cancel)?);
                     watching = Some(tokio::task::spawn_blocking(looks));
@@ -228,7 +229,7 @@ impl Ingest {
                 Some(Begun {
                     folder,
                     watching,
-                    missing: None,
+                    missing,
                 })
             }
             Followed::List(config) => {

@@ -1,4 +1,4 @@
-//! Named pipes where files should be.
+//! Named pipes and links to nothing where files should be.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -146,4 +146,30 @@ fn a_pipe_in_the_place_of_a_folder_of_images_is_told_once() {
         before.push(line);
     }
     panic!("the folder is not taken in: {before:#?}");
+}
+
+/// It is told once and not waited for, and the other images are taken in.
+#[cfg(unix)]
+#[test]
+fn a_link_to_nothing_in_the_place_of_an_image_is_told_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let [scope, archive] = ["scope", "archive"].map(|name| folder.path().join(name));
+    fs::create_dir_all(scope.join("s0")).unwrap();
+    let picture = |name: &str| {
+        let grey = image::GrayImage::from_pixel(40, 30, image::Luma([9]));
+        grey.save(scope.join("s0").join(name)).unwrap();
+    };
+    picture("r0_c0.png");
+    let link = scope.join("s0/r0_c1.png");
+    std::os::unix::fs::symlink("nowhere.png", &link).unwrap();
+    let of_names = ["--pattern", "s{section}/r{row}_c{column}.png"];
+    let sized = ["--extent", "99,99,1", "--voxel", "4", "--pitch", "40,30"];
+    let ingest = ["ingest", text(&scope), text(&archive), "--once"];
+    let ingest = [&ingest[..], &of_names, &sized].concat();
+    let once = run(&ingest);
+    ended(&once, 3, &["1 tiles taken in", text(&link)]);
+    let said = stderr(&once);
+    assert_eq!(said.matches("a link to nothing").count(), 1, "{said}");
+    picture("nowhere.png");
+    ended(&run(&ingest), 0, &["1 tiles taken in"]);
 }
