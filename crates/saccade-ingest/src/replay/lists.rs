@@ -1,6 +1,6 @@
 //! Files that say where the tiles of an acquisition lie, whatever program wrote them.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -290,15 +290,24 @@ fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
 }
 
 /// Tells apart what solutions call tiles: by their images, but by other words where several tiles have images of one name.
-fn tell_apart(tiles: &mut [Listed], otherwise: &[String]) {
+/// Such words may be what another image is called, of all those in `images`, and are then made others.
+fn tell_apart(tiles: &mut [Listed], otherwise: &[String], images: &HashSet<String>) {
     let mut of_name: HashMap<String, usize> = HashMap::new();
     for tile in &*tiles {
         *of_name.entry(tile.stem().to_owned()).or_default() += 1;
     }
+    let mut taken = images.clone();
     for (tile, otherwise) in tiles.iter_mut().zip(otherwise) {
-        tile.known_as = match of_name[tile.stem()] {
-            1 => tile.stem().to_owned(),
-            _ => otherwise.clone(),
+        let stem = tile.stem();
+        tile.known_as = match of_name[stem] {
+            1 => stem.to_owned(),
+            _ => {
+                let mut name = otherwise.clone();
+                while !taken.insert(name.clone()) {
+                    name = format!("{name} ({stem})");
+                }
+                name
+            }
         };
     }
 }
@@ -329,7 +338,15 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
         .map(|spec| listed(spec, &spec.file, None))
         .collect();
     let ids: Vec<_> = specs.iter().map(|spec| spec.id.clone()).collect();
-    tell_apart(&mut tiles, &ids);
+    let of_spec = |spec: &TileSpec| {
+        let channels = spec.channels.iter().map(|channel| &channel.file);
+        let files = [&spec.file].into_iter().chain(channels);
+        files
+            .map(|file| tile_list::stem(file).to_owned())
+            .collect::<Vec<_>>()
+    };
+    let images: HashSet<_> = specs.iter().flat_map(of_spec).collect();
+    tell_apart(&mut tiles, &ids, &images);
     let places = tiles
         .iter()
         .zip(&specs)
@@ -355,7 +372,7 @@ fn of_specs(path: &Path, specs: Vec<TileSpec>) -> List {
                 path.display()
             ));
         }
-        tell_apart(&mut tiles, &ids);
+        tell_apart(&mut tiles, &ids, &images);
         let names = tiles.iter().map(|tile| tile.known_as.clone());
         transforms.extend(names.zip(places));
         tiles

@@ -122,3 +122,39 @@ async fn an_id_is_one_tile_and_an_image_may_be_several() {
     let all = tiles().await;
     assert!((all["b"][4] - all["a"][4] - 61.0).abs() < 1e-9, "{all:?}");
 }
+
+/// What a tile is called says nothing of another's image.
+#[tokio::test]
+async fn an_id_may_be_what_the_image_of_another_tile_is_called() {
+    for shear in [0.0, 0.01] {
+        let scope = Scope::new();
+        let list = scope.file("specs.json");
+        let archive = archive(&scope.0.path().join("archive")).await;
+        scope.image("a", 1);
+        scope.image("b", 2);
+        for x in [0.0, 192.0] {
+            let want = [
+                ("a", [1.0, 0.0, 0.0, 1.0, x, 0.0]),
+                ("scope_a", [1.0, shear, 0.0, 1.0, x + 64.0, 0.0]),
+                ("b", [1.0, 0.0, 0.0, 1.0, x + 128.0, 0.0]),
+            ];
+            let specs = { [("b", "a"), ("2", "a"), ("3", "b")].iter().zip(want) }.map(
+                |((id, file), (_, transform))| {
+                    spec(id, file, &transform.map(|e| e.to_string()).join(" "))
+                },
+            );
+            write(&list, format!("[{}]", specs.collect::<Vec<_>>().join(",")));
+            scope.once(roomy(&list), &archive).await;
+            let there = seen(&archive).await;
+            assert_eq!(there.len(), 3);
+            for (name, transform) in want {
+                let there = there[name].transform;
+                let is_near = |(a, b): (f64, f64)| (a - b).abs() < 1e-9;
+                assert!(
+                    there.into_iter().zip(transform).all(is_near),
+                    "{name} with a shear of {shear} from {x} on: {there:?}"
+                );
+            }
+        }
+    }
+}
