@@ -196,14 +196,8 @@ impl Index {
     /// folders are most like those that the list names; none, if that could be several, or if it is as much like another one that the
     /// list names. If there is none, the same of what `file` means [`decoded`].
     pub(super) fn sought(&self, file: &str) -> Sought {
-        let meant = decoded(file);
-        let exact = self.exactly(file);
-        let exact = exact.or_else(|| self.exactly(meant.as_ref()?));
-        if let Some(path) = exact.as_ref().and_then(|path| path.to_str()) {
-            return Sought::There(path.to_owned());
-        }
         let as_written = self.sought_as(file);
-        let Some(decoded) = meant else {
+        let Some(decoded) = decoded(file) else {
             return as_written;
         };
         match as_written {
