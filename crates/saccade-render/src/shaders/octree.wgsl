@@ -44,7 +44,8 @@ const VAIN_LOOKS = 8u;
 const VAIN_LOOKS_MORE = 4u;
 const MOST_SPARED = 3u;
 
-// Regions in a row of which a look as close as the last one's found no more channels hidden than a look from farther away.
+// Regions in a row of which a look as close as the last one's found fewer than half of the channels hidden that a look from farther away
+// did not.
 var<private> vain_looks: u32;
 
 // Depths of the octree that a ray does not go down to for now.
@@ -207,8 +208,9 @@ fn region_at(level: u32, deepest_known: u32, depth: f32, ray: vec3f) -> Region {
                     alike |= bit;
                     settled |= bit;
                     uniform_stored[c] = f32(low) / steady.largest;
-                } else if low > 0u && visible * 4u > countOneBits(bins) * 3u {
-                    // Where nearly all is seen, a closer look finds little to skip. Bins do not say how much of it is nothing at all.
+                } else if (low > 0u || SLOTS > 1u) && visible * 4u > countOneBits(bins) * 3u {
+                    // Where nearly all is seen, a closer look finds little to skip. Bins do not say how much of it is nothing at all;
+                    // to look for that costs more the more channels there are.
                     settled |= bit;
                 }
             }
@@ -238,7 +240,9 @@ fn region_at(level: u32, deepest_known: u32, depth: f32, ray: vec3f) -> Region {
     if SLOTS > 1u {
         hidden_from_afar = path_known.near.y & 0xffffu;
     }
-    vain_looks = select(vain_looks + 1u, 0u, (hidden & ~hidden_from_afar) != 0u);
+    let seen_from_afar = everything & ~hidden_from_afar;
+    let newly_hidden = countOneBits(hidden & seen_from_afar);
+    vain_looks = select(vain_looks + 1u, 0u, newly_hidden * 2u >= countOneBits(seen_from_afar));
     return Region(hidden, alike, leaving_node(cell, at, ray));
 }
 
