@@ -173,8 +173,9 @@ fn noise(folder: &Path) -> String {
         for channel in 0..2_u32 {
             let voxels: Vec<u8> = (0..edge * edge * depth)
                 .map(|n: u32| {
-                    u8::try_from((n.wrapping_mul(2_654_435_761) >> 24) % 200 + 20 + channel)
-                        .unwrap()
+                    // Each channel is the brighter one somewhere.
+                    let noise = (n.wrapping_mul(2_654_435_761) >> 24) + 100 * channel;
+                    u8::try_from(noise % 200 + 20 + channel).unwrap()
                 })
                 .collect();
             let chunk = image.join(format!("{name}/c/{channel}/0/0/0"));
