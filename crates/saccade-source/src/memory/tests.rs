@@ -90,6 +90,58 @@ fn arrays_change() {
     block_on(check_changes(&source, 3, change, oracle, 0)).unwrap();
 }
 
+/// What is kept of chunks' values follows their voxels, at all levels.
+#[test]
+fn ranges_are_those_of_the_voxels_that_are_there_now() {
+    let source = array();
+    let volume = source.volume().clone();
+    let check = || {
+        let mut empty = 0;
+        for level in 0..volume.levels.len() {
+            for chunk in VoxelBox::of_size(volume.chunks(level)).iter() {
+                let level = level as u32;
+                let id = ChunkId {
+                    channel: 0,
+                    level,
+                    chunk,
+                };
+                let voxels = match block_on(source.read(id)).unwrap() {
+                    Chunk::Voxels(voxels) => voxels.to_vec(),
+                    Chunk::Empty => Vec::new(),
+                };
+                let measured = || voxels.iter().filter(|value| **value != 0);
+                let want = measured().min().zip(measured().max());
+                let got = source.value_range(id).map(|range| (range.min, range.max));
+                let want = want.map(|(min, max)| (u16::from(*min), u16::from(*max)));
+                assert_eq!(got, want, "{id}");
+                empty += u32::from(want.is_none());
+            }
+        }
+        empty
+    };
+    let before = check();
+    assert!(before > 0, "a third is empty");
+    // Across chunks, to the largest value, to the smallest, and to nothing at all.
+    let corner = |x, y, z| UVec3::new(x, y, z);
+    for (min, max, value) in [
+        (corner(15, 15, 3), corner(17, 17, 5), 255),
+        (corner(3, 1, 0), corner(4, 2, 1), 1),
+        (corner(32, 16, 4), corner(70, 33, 9), 0),
+    ] {
+        let voxels = VoxelBox::new(min, max);
+        let values = vec![value; voxels.voxels() as usize];
+        source.set(voxels, &values).unwrap();
+        check();
+    }
+    assert!(check() > before, "more is empty");
+    let beyond = ChunkId {
+        channel: 0,
+        level: 0,
+        chunk: volume.chunks(0),
+    };
+    assert_eq!(source.value_range(beyond), None);
+}
+
 #[test]
 fn listeners_that_fall_behind_are_told() {
     let source = array();
