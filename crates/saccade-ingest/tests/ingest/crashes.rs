@@ -238,6 +238,8 @@ impl Scene {
             workers: 1,
             keep_retired: Duration::ZERO,
             lease: LEASE,
+            // No image is to blame for a power cut, however often it is the one in hand.
+            attempts: u32::MAX,
             ..quick()
         };
         let folder = tempfile::tempdir().unwrap();
@@ -378,7 +380,8 @@ impl Scene {
         let tiles = seen(archive).await.into_iter();
         let tiles: BTreeMap<_, _> = tiles.map(|(name, tile)| (name, tile.pyramid)).collect();
         if tiles != self.tiles {
-            return Err(format!("not all arrived: {tiles:?}"));
+            let set_aside = archive.catalog().quarantined(VOLUME).await;
+            return Err(format!("not all arrived: {tiles:?}, {set_aside:?}"));
         }
         let named: Vec<_> = tiles.into_values().collect();
         self.is_whole(&named, disk)?;
