@@ -124,6 +124,17 @@ impl Inner {
             Database::Postgres(_) => None,
         }
     }
+
+    /// The same before anybody has noticed.
+    fn away_now(&self) -> Option<CatalogError> {
+        match &self.database {
+            Database::Sqlite(opened) if opened.is_away() => Some(CatalogError::Away {
+                why: None,
+                location: self.location.clone(),
+            }),
+            Database::Sqlite(_) | Database::Postgres(_) => None,
+        }
+    }
 }
 
 impl Catalog {
@@ -447,7 +458,10 @@ impl Catalog {
         }
         let rows = self.inner.database.all(question, values).await;
         let rows = rows.and_then(|rows| rows.iter().map(understand).collect());
-        rows.map_err(|e| self.inner.away().unwrap_or_else(|| self.failed(e)))
+        rows.map_err(|e| {
+            let away = self.inner.away().or_else(|| self.inner.away_now());
+            away.unwrap_or_else(|| self.failed(e))
+        })
     }
 
     async fn transaction(&self, durability: Durability) -> Result<Transaction, CatalogError> {

@@ -87,11 +87,25 @@ impl Opened {
         is_news
     }
 
+    /// The file that is read.
+    fn read_id(&self) -> Option<FileId> {
+        let newer = lock(&self.replaced.newer);
+        newer.as_ref().map_or(self.id, |newer| newer.id)
+    }
+
+    /// Whether nothing, or something else, has the name of the file that is read: also before that is said to be away.
+    pub(in crate::catalog) fn is_away(&self) -> bool {
+        let found = FileId::of(&self.path);
+        match (self.read_id(), found) {
+            (Some(read), Ok(found)) => read != found,
+            (Some(_), Err(e)) => e.kind() == std::io::ErrorKind::NotFound,
+            (None, _) => false,
+        }
+    }
+
     /// Looks which file has its name.
     pub(in crate::catalog) fn place(&self) -> Place {
-        let open = lock(&self.replaced.newer);
-        let open = open.as_ref().map_or(self.id, |newer| newer.id);
-        let (Some(open), found) = (open, look(&self.path)) else {
+        let (Some(open), found) = (self.read_id(), look(&self.path)) else {
             return Place::Same;
         };
         let found = match found {
@@ -156,6 +170,7 @@ mod tests {
 
     use super::super::options;
     use super::*;
+    use crate::catalog::database::Database;
     use crate::catalog::{Catalog, NewTile};
 
     const SOON: Duration = Duration::from_secs(20);
@@ -186,12 +201,19 @@ mod tests {
         [path.to_owned(), of("-wal"), of("-shm")]
     }
 
+    /// Nobody who opens it meanwhile finds the file without its log.
     fn rename(from: &Path, to: &Path) {
-        for (from, to) in files(from).iter().zip(files(to)) {
+        let aside = to.with_extension("on-its-way");
+        std::fs::rename(from, &aside).unwrap();
+        for file in files(to) {
+            let _what_there_is_of_them = std::fs::remove_file(file);
+        }
+        for (from, to) in files(from).iter().zip(files(to)).skip(1) {
             if from.exists() {
                 std::fs::rename(from, to).unwrap();
             }
         }
+        std::fs::rename(aside, to).unwrap();
     }
 
     async fn until<T>(mut is_so: impl AsyncFnMut() -> Option<T>) -> T {
@@ -283,6 +305,30 @@ mod tests {
         writing.close().await;
         rename(&aside, &path);
         until(async || tiles().await.filter(|&tiles| tiles == 2)).await;
+    }
+
+    /// Whoever needs a connection more finds no file, before anybody has looked for it.
+    #[tokio::test]
+    async fn who_asks_before_it_is_noticed_is_told_as_well() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalog.sqlite");
+        let catalog = with_tiles(&path, 1).await;
+        catalog.entry("v").await.unwrap();
+        let Database::Sqlite(opened) = &catalog.inner.database else {
+            unreachable!("a file");
+        };
+        // Others have all that are open.
+        let readers = opened.readers();
+        let mut held = Vec::new();
+        while readers.num_idle() > 0 || held.is_empty() {
+            held.push(readers.acquire().await.unwrap());
+        }
+        rename(&path, &folder.path().join("aside"));
+        let error = catalog.entry("v").await.unwrap_err();
+        assert!(
+            matches!(error, CatalogError::Away { why: None, .. }),
+            "{error:?}"
+        );
     }
 
     /// Two catalogs of other archives.
