@@ -19,6 +19,7 @@
 //! would show files that are another's. The folder itself may be one.
 
 mod key;
+pub mod listed_images;
 mod record;
 mod text;
 pub mod tile_configuration;
@@ -32,7 +33,7 @@ use std::io;
 use std::path::{Component, Path, PathBuf};
 
 use glam::{DVec3, UVec3};
-use saccade_core::volume::{Dtype, Volume, VolumeError, VoxelKind};
+use saccade_core::volume::{Dtype, Volume, VolumeError, VoxelKind, check_name};
 use serde::{Deserialize, Serialize};
 
 use crate::storage::{SystemDisk, read_regular, write_whole};
@@ -108,6 +109,14 @@ pub enum AcquisitionError {
     Channels {
         /// What is wrong with them.
         mistake: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// `volume.json` describes no volume that can be.
+    #[error("the acquisition archive describes no possible volume; mend {}", path.display())]
+    Volume {
+        /// What is wrong.
+        source: VolumeError,
         /// File.
         path: PathBuf,
     },
@@ -206,6 +215,7 @@ impl AcquisitionError {
             | Self::Info { path, .. }
             | Self::Key { path, .. }
             | Self::Channels { path, .. }
+            | Self::Volume { path, .. }
             | Self::LeadsOut { path }
             | Self::RecordsCut { path, .. }
             | Self::RecordsReplaced { path, .. }
@@ -297,6 +307,27 @@ impl AcquisitionInfo {
             Some(mistake) => Err(AcquisitionError::Channels { mistake, path }),
             None => Ok(info),
         }
+    }
+
+    /// Reads which volume an acquisition archive describes; with another name for it, the file's does not count.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::read`], and [`AcquisitionError::Volume`].
+    pub fn read_volume(folder: &Path, name: Option<&str>) -> Result<Volume, AcquisitionError> {
+        let info = Self::read(folder)?;
+        let described = info.volume().and_then(|volume| match name {
+            // Whoever takes it in looks at that.
+            Some(name) => Ok(Volume {
+                name: name.to_owned(),
+                ..volume
+            }),
+            None => check_name(&volume.name).map(|()| volume),
+        });
+        described.map_err(|source| AcquisitionError::Volume {
+            source,
+            path: folder.join(Self::FILE),
+        })
     }
 
     /// What is wrong with the channels' names, by which tiles name them; `None` if nothing is.
@@ -403,9 +434,10 @@ mod tests {
         let list = tile_list::read(&data.join("DEMO_post_mongo/rick0.txt")).unwrap();
         let patches = trakem2::read(&data.join("temp0_final/stack/Affine.xml")).unwrap();
         assert_eq!((list.len(), patches.len()), (42, 42));
-        let images = tile_list::Images::below(&data.join("StarterMaterials/TIF")).unwrap();
-        for tile in &list {
-            let image = images.find(&tile.file).unwrap();
+        let images = listed_images::Images::below(&data.join("StarterMaterials/TIF")).unwrap();
+        let found = images.of_list(list.iter().map(|tile| &*tile.file));
+        for (tile, image) in list.iter().zip(found) {
+            let image = image.unwrap();
             assert!(
                 image.ends_with(format!("{}.tif", tile.name())),
                 "{}",

@@ -1,13 +1,10 @@
 //! Plain tile lists: `file x y z` per line, as TrakEM2 imports them.
 
-use std::collections::BTreeMap;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use glam::DVec2;
 
 use super::AcquisitionError;
-use super::image_path;
 use super::text::{content, quoted};
 use crate::percent;
 use crate::storage::read_regular;
@@ -159,102 +156,10 @@ fn listed(text: &str, line: u64) -> Result<ListedTile, String> {
     })
 }
 
-/// Finds images by file name anywhere below a folder: lists name folders of other machines.
-#[derive(Clone, Debug)]
-pub struct Images {
-    folder: PathBuf,
-    by_name: BTreeMap<String, PathBuf>,
-    /// Another of each name that several have.
-    others: BTreeMap<String, PathBuf>,
-}
-
-impl Images {
-    /// Looks through a folder and the folders in it.
-    ///
-    /// # Errors
-    ///
-    /// [`AcquisitionError::Read`] for a folder that cannot be listed.
-    pub fn below(folder: &Path) -> Result<Self, AcquisitionError> {
-        let (mut by_name, mut others) = (BTreeMap::new(), BTreeMap::new());
-        let mut open = vec![folder.to_owned()];
-        while let Some(at) = open.pop() {
-            let failed = |source| AcquisitionError::Read {
-                source,
-                path: at.clone(),
-            };
-            for entry in fs::read_dir(&at).map_err(failed)? {
-                let entry = entry.map_err(failed)?;
-                let kind = entry.file_type().map_err(failed)?;
-                if kind.is_dir() {
-                    open.push(entry.path());
-                } else if let Some(name) = entry.file_name().to_str() {
-                    // The smallest path, so that the answer does not depend on the disk's order.
-                    let path = entry.path();
-                    let known = by_name
-                        .entry(name.to_owned())
-                        .or_insert_with(|| path.clone());
-                    if path < *known {
-                        others.insert(name.to_owned(), std::mem::replace(known, path));
-                    } else if path != *known {
-                        others.insert(name.to_owned(), path);
-                    }
-                }
-            }
-        }
-        Ok(Self {
-            folder: folder.to_owned(),
-            by_name,
-            others,
-        })
-    }
-
-    /// The image that [`Self::find`] takes for `file`, and another that may be meant as well, since several have its name and
-    /// none lies at that path.
-    pub fn several(&self, file: &str) -> Option<[&Path; 2]> {
-        match self.found(file)? {
-            Found::AtPath(_) => None,
-            Found::ByName(name, path) => Some([path, self.others.get(name)?]),
-        }
-    }
-
-    /// The image that a list calls `file`: at that path below the folder, else by name alone; if there is none, the same of
-    /// what it means [`decoded`].
-    pub fn find(&self, file: &str) -> Option<PathBuf> {
-        Some(match self.found(file)? {
-            Found::AtPath(path) => path,
-            Found::ByName(_, path) => path.to_owned(),
-        })
-    }
-
-    fn found(&self, file: &str) -> Option<Found<'_>> {
-        let at_path = |file: &str| {
-            let path = image_path(&self.folder, file)?;
-            path.is_file().then_some(Found::AtPath(path))
-        };
-        let by_name = |file: &str| {
-            let (name, path) = self.by_name.get_key_value(base(file))?;
-            Some(Found::ByName(name, path))
-        };
-        let decoded = decoded(file);
-        let decoded = decoded.as_deref();
-        // Where only folders are encoded, no file has another name.
-        let same_name = decoded.filter(|decoded| base(decoded) == base(file));
-        at_path(file)
-            .or_else(|| at_path(same_name?))
-            .or_else(|| by_name(file))
-            .or_else(|| at_path(decoded?))
-            .or_else(|| by_name(decoded?))
-    }
-}
-
-/// How an image was found.
-enum Found<'a> {
-    AtPath(PathBuf),
-    ByName(&'a str, &'a Path),
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]
@@ -326,93 +231,6 @@ mod tests {
                 matches!(read(bad), Err(AcquisitionError::Line { .. })),
                 "{bad}"
             );
-        }
-    }
-
-    #[test]
-    fn images_are_found_by_name() {
-        let folder = tempfile::tempdir().unwrap();
-        fs::create_dir_all(folder.path().join("deep/er")).unwrap();
-        fs::create_dir_all(folder.path().join("other")).unwrap();
-        for file in ["deep/er/a.tif", "other/a.tif", "b.tif"] {
-            fs::write(folder.path().join(file), "").unwrap();
-        }
-        let images = Images::below(folder.path()).unwrap();
-        let found = |file| {
-            images
-                .find(file)
-                .map(|p| p.strip_prefix(folder.path()).unwrap().to_owned())
-        };
-        assert_eq!(found("other/a.tif").unwrap(), Path::new("other/a.tif"));
-        assert_eq!(found("editme/a.tif").unwrap(), Path::new("deep/er/a.tif"));
-        assert_eq!(found("C:\\scope\\b.tif").unwrap(), Path::new("b.tif"));
-        assert_eq!(found("none.tif"), None);
-        let [taken, other] = images.several("editme/a.tif").unwrap();
-        assert!(taken.ends_with("deep/er/a.tif") && other.ends_with("other/a.tif"));
-        for clear in ["other/a.tif", "b.tif", "none.tif"] {
-            assert_eq!(images.several(clear), None, "{clear}");
-        }
-    }
-
-    #[test]
-    fn names_of_urls_are_found_decoded_where_no_file_has_them_as_they_are() {
-        let folder = tempfile::tempdir().unwrap();
-        fs::create_dir_all(folder.path().join("in/a b")).unwrap();
-        fs::create_dir_all(folder.path().join("other")).unwrap();
-        let files = [
-            "in/t#1.tif",
-            "in/ü.tif",
-            "in/both 1.tif",
-            "other/both%201.tif",
-            "in/50%.tif",
-            "in/100%2525.tif",
-            "in/a b/same.tif",
-            "in/same.tif",
-            "x.tif",
-        ];
-        for file in files {
-            fs::write(folder.path().join(file), "").unwrap();
-        }
-        // What lies beside the folder is out of reach.
-        let inner = folder.path().join("in");
-        let all = Images::below(folder.path()).unwrap();
-        let inside = Images::below(&inner).unwrap();
-        let found = |images: &Images, file| {
-            let path = images.find(file)?;
-            Some(path.strip_prefix(folder.path()).unwrap().to_owned())
-        };
-        for (listed, there) in [
-            ("/scope/a%20b/t%231.tif", "in/t#1.tif"),
-            ("in/t%231.tif", "in/t#1.tif"),
-            ("/scope/%C3%BC.tif", "in/ü.tif"),
-            ("/scope/50%25.tif", "in/50%.tif"),
-            // As it is, also elsewhere, before what it means.
-            ("in/both%201.tif", "other/both%201.tif"),
-            ("/scope/100%2525.tif", "in/100%2525.tif"),
-            // Where only the folder is encoded, it tells which one is meant.
-            ("in/a%20b/same.tif", "in/a b/same.tif"),
-        ] {
-            assert_eq!(
-                found(&all, listed).as_deref(),
-                Some(Path::new(there)),
-                "{listed}"
-            );
-        }
-        assert_eq!(all.several("in/a%20b/same.tif"), None);
-        assert!(all.several("/scope/s%61me.tif").is_some());
-        for nothing in [
-            "%2e%2e%2fx.tif",
-            "%2E%2E/x.tif",
-            "a%20b%2Fsame.tif",
-            "..%5cx.tif",
-            "%2e%2e",
-            "%2e",
-            "x%00.tif",
-            "%ff.tif",
-            "t%2.tif",
-            "t%zz1.tif",
-        ] {
-            assert_eq!(found(&inside, nothing), None, "{nothing}");
         }
     }
 }

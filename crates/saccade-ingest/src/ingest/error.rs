@@ -1,9 +1,6 @@
-use std::path::PathBuf;
-
 use saccade_archive::acquisition::AcquisitionError;
 use saccade_archive::catalog::CatalogError;
 use saccade_archive::storage::StorageError;
-use saccade_core::volume::VolumeError;
 
 /// Why ingest ended early. What was acknowledged is safe; starting again goes on from there.
 #[derive(Debug, thiserror::Error)]
@@ -12,14 +9,6 @@ pub enum IngestError {
     /// The acquisition archive cannot be used.
     #[error(transparent)]
     Acquisition(#[from] AcquisitionError),
-    /// The acquisition archive describes no volume that can be.
-    #[error("the acquisition archive describes no possible volume; mend {}", path.display())]
-    Volume {
-        /// What is wrong.
-        source: VolumeError,
-        /// Its `volume.json`.
-        path: PathBuf,
-    },
     /// The catalog cannot be used.
     #[error(transparent)]
     Catalog(#[from] CatalogError),

@@ -14,7 +14,6 @@ use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
 use saccade_archive::catalog::{CatalogError, Waiting, Worker};
 use saccade_archive::clock::Clock;
 use saccade_archive::storage::StorageError;
-use saccade_core::volume::check_name;
 use tokio::sync::mpsc;
 
 use super::earlier::Earlier;
@@ -79,17 +78,7 @@ pub async fn run(
         clock: archive.catalog().clock(),
     };
     let progress: &dyn Progress = &heard;
-    let info = AcquisitionInfo::read(acquisition)?;
-    let impossible = |source| IngestError::Volume {
-        source,
-        path: acquisition.join(AcquisitionInfo::FILE),
-    };
-    let mut volume = info.volume().map_err(impossible)?;
-    match &options.volume {
-        // The catalog looks at it; the file is not to blame.
-        Some(name) => volume.name.clone_from(name),
-        None => check_name(&volume.name).map_err(impossible)?,
-    }
+    let volume = AcquisitionInfo::read_volume(acquisition, options.volume.as_deref())?;
     let catalog = archive.catalog();
     let clock = catalog.clock();
     retry(clock, options, progress, || catalog.create_volume(&volume)).await?;

@@ -6,7 +6,7 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec2, UVec2, UVec3};
-use saccade_archive::acquisition::tile_list::Images;
+use saccade_archive::acquisition::listed_images::Images;
 use saccade_archive::image::{Wanted, decode_file_as, read_bits};
 use saccade_core::transform::{SectionFromTile, TilePoint};
 use saccade_core::volume::Dtype;
@@ -97,10 +97,9 @@ impl Acquisition {
     ) -> Result<Self, ReplayError> {
         let names = unique_names(listed);
         let first_section = listed.iter().map(|tile| tile.section).min().unwrap_or(0);
-        let missing: Vec<_> = listed
-            .iter()
-            .filter(|t| images.find(&t.file).is_none())
-            .collect();
+        let found = images.of_list(lists::files(listed));
+        let missing = { listed.iter().zip(&found) }.filter(|(_, image)| image.is_none());
+        let missing: Vec<_> = missing.map(|(tile, _)| tile).collect();
         if let Some(first) = missing.first() {
             return Err(ReplayError::MissingImages {
                 missing: missing.len(),
@@ -112,8 +111,8 @@ impl Acquisition {
         }
         let mut tiles = Vec::new();
         let (mut deep, mut shallow) = (0, 0);
-        for (tile, name) in listed.iter().zip(names) {
-            let Some(image) = images.find(&tile.file) else {
+        for ((tile, name), image) in listed.iter().zip(names).zip(found) {
+            let Some(image) = image else {
                 continue;
             };
             let size = image_size(&image)?;

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use saccade_archive::acquisition::tile_list::Images;
+use saccade_archive::acquisition::listed_images::Images;
 use saccade_archive::acquisition::{AcquisitionError, AcquisitionInfo, is_inside, trakem2};
 
 use super::acquisition::median_offset;
@@ -195,10 +195,7 @@ pub fn find_list(folder: &Path) -> Result<Option<PathBuf>, ReplayError> {
     }
     for path in projects(&tree) {
         let patches = trakem2::read(path)?;
-        if patches
-            .iter()
-            .any(|patch| images.find(&patch.file).is_some())
-        {
+        if patches.iter().any(|patch| images.has(&patch.file)) {
             return Ok(Some(path.to_owned()));
         }
     }
@@ -256,10 +253,8 @@ fn chosen(tree: &Tree, images: &Images) -> Result<Option<(PathBuf, List, bool)>,
             Err(_) => continue,
         };
         let tiles = listed.of_all_channels();
-        let here = tiles
-            .iter()
-            .filter(|tile| images.find(&tile.file).is_some());
-        let found = here.count();
+        let here = images.of_list(lists::files(tiles));
+        let found = here.iter().flatten().count();
         if found > 0 && found == tiles.len() {
             return Ok(Some((list.to_owned(), listed, true)));
         }
@@ -285,7 +280,7 @@ fn another<'a>(tree: &'a Tree, images: &Images, list: &Path) -> Option<&'a Path>
     others.take(MOST).find(|path| {
         lists::read(path).is_ok_and(|listed| {
             let mut tiles = listed.of_all_channels().iter();
-            tiles.any(|tile| images.find(&tile.file).is_some())
+            tiles.any(|tile| images.has(&tile.file))
         })
     })
 }
@@ -299,7 +294,7 @@ fn has_extension(path: &Path, extension: &str) -> bool {
 fn refuse_project_alone(tree: &Tree, images: &Images) -> Result<(), ReplayError> {
     for path in projects(tree) {
         let patches = trakem2::read(path)?;
-        let here = |patch: &&trakem2::Patch| images.find(&patch.file).is_some();
+        let here = |patch: &&trakem2::Patch| images.has(&patch.file);
         let here = patches.iter().filter(here).count();
         if here > 0 {
             return Err(ReplayError::NoList {

@@ -6,7 +6,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use glam::{DVec2, UVec2};
-use saccade_archive::acquisition::tile_list::{self, Images, ListedTile};
+use saccade_archive::acquisition::listed_images::Images;
+use saccade_archive::acquisition::tile_list::{self, ListedTile};
 use saccade_archive::acquisition::tile_specs::{self, TileSpec};
 use saccade_archive::acquisition::trakem2::{self, Patch};
 use saccade_archive::acquisition::{
@@ -130,10 +131,9 @@ impl List {
 
     /// Says which of several images of one name are taken.
     pub(crate) fn say_several(&self, images: &Images, list: &Path) {
-        let mut several =
-            { self.of_all_channels().iter() }.filter_map(|tile| images.several(&tile.file));
-        if let Some([taken, other]) = several.next() {
-            let all = 1 + several.count();
+        let several = images.several(files(self.of_all_channels()));
+        if let Some([taken, other]) = several.first() {
+            let all = several.len();
             log::warn!(
                 "the names of {all} images of the list are in several folders: taken is {}, for one, and not {}; name them with \
                  their folders in the list: {}",
@@ -150,6 +150,11 @@ impl List {
             log::warn!("{note}");
         }
     }
+}
+
+/// The images of tiles, as the list names them.
+pub(super) fn files(tiles: &[Listed]) -> impl Iterator<Item = &str> + Clone {
+    tiles.iter().map(|tile| &*tile.file)
 }
 
 /// Each name once, in the order in which they come.
@@ -241,7 +246,7 @@ pub(super) fn is_meant(path: &Path, images: &Images) -> bool {
         let has = |word| text.contains(word);
         return text.trim_start().starts_with('[') && has("\"tileId\"") && has("\"mipmapLevels\"");
     }
-    let is_there = |file: &str| !file.is_empty() && images.find(file).is_some();
+    let is_there = |file: &str| !file.is_empty() && images.has(file);
     let listed = |line: &str| {
         // One number may be wrong, or missing.
         [2, 3].into_iter().any(|columns| {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use glam::{UVec2, UVec3};
 use saccade_archive::VisualizationArchive;
-use saccade_archive::acquisition::RecordReader;
+use saccade_archive::acquisition::{AcquisitionError, RecordReader};
 use saccade_archive::catalog::{CatalogError, ChangeReason};
 use saccade_archive::pyramid::Encoding;
 use saccade_ingest::Cancel;
@@ -314,5 +314,11 @@ async fn wrong_archives_are_refused() {
 
     info(UVec3::new(10, 0, 10)).write(scope.path()).unwrap();
     let flat = fails(scope.path(), &quick()).await;
-    assert!(matches!(flat, IngestError::Volume { .. }), "{flat}");
+    assert!(
+        matches!(
+            flat,
+            IngestError::Acquisition(AcquisitionError::Volume { .. })
+        ),
+        "{flat}"
+    );
 }

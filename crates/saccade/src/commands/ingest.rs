@@ -308,7 +308,15 @@ impl Ingest {
         let settled = self.bare.settled();
         let (mut said, mut wrong, mut looks) = (String::new(), String::new(), 0);
         loop {
-            let error = match self.bare.followed(&self.acquisition, name, kept) {
+            let found = self.bare.followed(&self.acquisition, name, kept);
+            let found = found.and_then(|followed| {
+                if matches!(followed, Followed::Records) {
+                    let named = self.volume.as_deref();
+                    AcquisitionInfo::read_volume(&self.acquisition, named)?;
+                }
+                Ok(followed)
+            });
+            let error = match found {
                 Ok(followed) => return Ok(Some(followed)),
                 Err(error) if self.once || !is_being_written(&error, settled) => return Err(error),
                 Err(error) => error,

@@ -323,6 +323,25 @@ fn a_description_with_a_slip_is_told_until_it_is_mended() {
     write(r#"{"name":"cortex","extend":[100,100,5],"voxel_nm":[4,4,40]}"#);
     let said = says(&following.stderr, "is read again");
     assert!(said.contains("extend"), "{said}");
+    // What can be read, but is no volume.
+    for (impossible, why) in [
+        (
+            r#"{"name":"cortex","extent":[100,100,5],"voxel_nm":[0,4,40]}"#,
+            "not positive",
+        ),
+        (
+            r#"{"name":"cortex","extent":[100,0,5],"voxel_nm":[4,4,40]}"#,
+            "at least 1 voxel",
+        ),
+        (
+            r#"{"name":"../x","extent":[100,100,5],"voxel_nm":[4,4,40]}"#,
+            "cannot name a volume",
+        ),
+    ] {
+        write(impossible);
+        let said = says(&following.stderr, "is read again");
+        assert!(said.contains(why) && said.contains("volume.json"), "{said}");
+    }
     write(r#"{"name":"cortex","extent":[100,100,5],"voxel_nm":[4,4,40]}"#);
     says(&following.stderr, "1 of 1 tiles");
 }

@@ -2,6 +2,8 @@
 
 use std::collections::HashMap;
 
+use saccade_archive::acquisition::tile_list::decoded;
+
 use super::source::{Listing, Named};
 use super::{ListConfig, ListError};
 use crate::replay::lists::channel_names;
@@ -43,7 +45,9 @@ impl Listing {
             if tile.channel.is_some() {
                 return true;
             }
-            match pattern.channel(&tile.file) {
+            // Part of a URL means what it is decoded.
+            let meant = decoded(&tile.file).and_then(|file| pattern.channel(&file).ok());
+            match meant.map_or_else(|| pattern.channel(&tile.file), Ok) {
                 Ok(channel) => {
                     tile.channel = Some(channel);
                     true

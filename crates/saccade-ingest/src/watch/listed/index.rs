@@ -3,15 +3,16 @@
 //! A look asks so many folders and entries, lists only folders that changed since they were last listed, and goes on
 //! where the last one stopped. Sixteen bytes are kept per file.
 
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap};
 use std::fs;
-use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
 use std::ops::Bound;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use saccade_archive::acquisition::image_path;
+use saccade_archive::acquisition::listed_images::{Ends, Files, Mentions, Seeker};
+pub(super) use saccade_archive::acquisition::listed_images::{Sought, key, names};
 pub(super) use saccade_archive::acquisition::tile_list::base;
 use saccade_archive::acquisition::tile_list::decoded;
 
@@ -40,6 +41,8 @@ pub(super) struct Index {
     root: PathBuf,
     folders: Vec<Folder>,
     paths: HashMap<PathBuf, usize>,
+    /// The folders in the order of their ends.
+    ends: Ends<usize>,
     /// The folder that is asked next.
     at: usize,
     listing: Option<Listing>,
@@ -49,30 +52,13 @@ pub(super) struct Index {
     several: HashMap<u64, BTreeSet<usize>>,
     /// Files that may be projects of TrakEM2, below the root.
     projects: BTreeSet<PathBuf>,
-    /// How many images that the list names end in a name, or in a name with folders before it, by the hash of that. With folders
-    /// only where several have the name.
-    listed: HashMap<u64, u32>,
+    mentions: Mentions,
     /// What was looked for and is nothing to read, below the root.
     odd: BTreeSet<PathBuf>,
     /// Which of them was looked at again last.
     odd_at: PathBuf,
     changed: bool,
     went_round: bool,
-}
-
-/// What is found under a name.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Sought {
-    /// The image, below the root.
-    There(String),
-    /// Images in several folders, of which the list does not say which one it means; two of them.
-    Several([PathBuf; 2]),
-    Missing,
-}
-
-/// The hash by which a name or path is known.
-pub(super) fn key(name: &str) -> u64 {
-    BuildHasherDefault::<DefaultHasher>::default().hash_one(name)
 }
 
 /// Why what lies there is nothing to read; `None` if it is a file, or if nothing is there. Nothing is opened.
@@ -88,31 +74,6 @@ fn oddity(path: &Path) -> Option<&'static str> {
     }
 }
 
-/// A path's last part and so many folders before it, however they are separated; `None` if there are not so many.
-fn tail(file: &str, folders: usize) -> Option<String> {
-    let parts = file.rsplit(['/', '\\']);
-    let parts = parts.filter(|part| !matches!(*part, "" | "."));
-    let parts: Vec<_> = parts.take(folders + 1).collect();
-    (parts.len() > folders).then(|| parts.join("/"))
-}
-
-/// How many folders two paths have in common from their ends on.
-fn likeness(path: &Path, file: &str) -> usize {
-    let folders = path.components().rev().skip(1);
-    let named = file.rsplit(['/', '\\']).skip(1);
-    let both = folders.zip(named);
-    both.take_while(|(folder, named)| folder.as_os_str() == *named)
-        .count()
-}
-
-/// The names that the image may have which a list calls `file`: as it is written, and as it is meant if that is part of a
-/// URL.
-pub(super) fn names(file: &str) -> impl Iterator<Item = String> {
-    let meant = decoded(file).map(|decoded| base(&decoded).to_owned());
-    let meant = meant.filter(|name| name != base(file));
-    [base(file).to_owned()].into_iter().chain(meant)
-}
-
 impl Index {
     pub(super) fn new(root: &Path) -> Self {
         let whole = Folder {
@@ -124,12 +85,13 @@ impl Index {
             root: root.to_owned(),
             folders: vec![whole],
             paths: HashMap::from([(PathBuf::new(), 0)]),
+            ends: Ends::default(),
             at: 0,
             listing: None,
             files: HashMap::new(),
             several: HashMap::new(),
             projects: BTreeSet::new(),
-            listed: HashMap::new(),
+            mentions: Mentions::default(),
             odd: BTreeSet::new(),
             odd_at: PathBuf::new(),
             changed: false,
@@ -148,100 +110,22 @@ impl Index {
 
     /// Takes over which images a list names.
     pub(super) fn know<'a>(&mut self, files: impl Iterator<Item = &'a str>) {
-        // Folders in common beyond these are not told apart.
-        const MOST_FOLDERS: usize = 8;
-        let spellings = |file: &str| [Some(file.to_owned()), decoded(file)].into_iter().flatten();
-        let mut known = HashSet::new();
-        let mut is_new =
-            |file: &&str| known.insert(key(&decoded(file).unwrap_or((*file).to_owned())));
-        let files: Vec<&str> = files.filter(&mut is_new).collect();
-        self.listed.clear();
-        for file in &files {
-            let names: BTreeSet<u64> = spellings(file).map(|file| key(base(&file))).collect();
-            for name in names {
-                *self.listed.entry(name).or_default() += 1;
-            }
-        }
-        let names = self.listed.iter().filter(|(_, count)| **count > 1);
-        let shared: HashSet<u64> = names.map(|(name, _)| *name).collect();
-        let is_shared = |file: &str| shared.contains(&key(base(file)));
-        for file in &files {
-            let mut tails = BTreeSet::new();
-            for spelling in spellings(file).filter(|file| is_shared(file)) {
-                let of = (1..=MOST_FOLDERS).map_while(|folders| tail(&spelling, folders));
-                tails.extend(of.map(|tail| key(&tail)));
-            }
-            for tail in tails {
-                *self.listed.entry(tail).or_default() += 1;
-            }
+        self.mentions = Mentions::of(files);
+    }
+
+    fn seeker(&self) -> Seeker<'_, Self> {
+        Seeker {
+            files: self,
+            mentions: &self.mentions,
         }
     }
 
-    /// Whether an image that lies elsewhere may be what a list calls `file`: not, if it is as much like another one that the
-    /// list names, or more.
-    fn may_be(&self, path: &Path, file: &str) -> bool {
-        let tail = tail(file, likeness(path, file));
-        let count = tail.and_then(|tail| self.listed.get(&key(&tail)).copied());
-        count.unwrap_or(0) <= 1
-    }
-
-    /// The image at the path that a list calls `file`.
-    fn exactly(&self, file: &str) -> Option<PathBuf> {
-        let named = image_path(Path::new(""), file)?;
-        let is_there = self.root.join(&named).is_file();
-        is_there.then(|| named.components().collect())
-    }
-
-    /// The image that a list calls `file`: at that path, else by name alone. Of several of that name the one whose
-    /// folders are most like those that the list names; none, if that could be several, or if it is as much like another one that the
-    /// list names. If there is none, the same of what `file` means [`decoded`].
+    /// The image that a list calls `file`, see [`Seeker::sought`].
     pub(super) fn sought(&self, file: &str) -> Sought {
-        let as_written = self.sought_as(file);
-        let Some(decoded) = decoded(file) else {
-            return as_written;
-        };
-        match as_written {
-            Sought::There(_) => as_written,
-            Sought::Missing => self.sought_as(&decoded),
-            // Where only folders are encoded, they may tell which one is meant.
-            Sought::Several(_) if base(&decoded) == base(file) => match self.sought_as(&decoded) {
-                there @ Sought::There(_) => there,
-                Sought::Several(_) | Sought::Missing => as_written,
-            },
-            Sought::Several(_) => as_written,
+        match self.seeker().sought(file) {
+            Sought::There(path) if path.to_str().is_none() => Sought::Missing,
+            sought => sought,
         }
-    }
-
-    fn sought_as(&self, file: &str) -> Sought {
-        let there = |path: &Path| match path.to_str() {
-            Some(path) => Sought::There(path.to_owned()),
-            None => Sought::Missing,
-        };
-        if let Some(path) = self.exactly(file) {
-            return there(&path);
-        }
-        let paths = self.called(base(file));
-        let paths = paths.filter(|path| self.may_be(path, file));
-        let paths = paths.filter(|path| self.root.join(path).is_file());
-        let mut paths: Vec<(usize, PathBuf)> =
-            paths.map(|path| (likeness(&path, file), path)).collect();
-        let best = paths.iter().map(|(like, _)| *like).max().unwrap_or(0);
-        paths.retain(|(like, _)| *like == best);
-        paths.sort();
-        match &paths[..] {
-            [] => Sought::Missing,
-            [(_, path)] => there(path),
-            [(_, one), (_, other), ..] => Sought::Several([one.clone(), other.clone()]),
-        }
-    }
-
-    /// Where files of a name were seen, below the root.
-    fn called(&self, name: &str) -> impl Iterator<Item = PathBuf> {
-        let hash = key(name);
-        let (first, several) = (self.files.get(&hash), self.several.get(&hash));
-        let folders = several.into_iter().flatten();
-        let folders = folders.chain(first.filter(|_| several.is_none()));
-        folders.map(move |folder| self.folders[*folder].path.join(name))
     }
 
     /// The same; what is not where it was is looked for anew.
@@ -251,7 +135,7 @@ impl Index {
             for name in names(file) {
                 // Those that are there may be others that the list names.
                 if !self
-                    .called(&name)
+                    .called(&name, "")
                     .any(|path| self.root.join(path).is_file())
                 {
                     self.forget(&name);
@@ -277,53 +161,20 @@ impl Index {
         }
     }
 
-    /// Whether an image that has come fits what a list calls `file` better than the one that was found.
+    /// See [`Seeker::may_be`].
+    pub(super) fn may_be(&self, path: &str, file: &str) -> bool {
+        self.seeker().may_be(Path::new(path), file)
+    }
+
+    /// See [`Seeker::fits_better`].
     pub(super) fn fits_better(&self, come: &str, found: &str, file: &str) -> bool {
-        let fit = |path: &str| {
-            let like = |file: &str| likeness(Path::new(path), file);
-            let as_meant = decoded(file).map_or(0, |meant| like(&meant));
-            (like(file).max(as_meant), base(path) == base(file))
-        };
-        // The file system is asked of few.
-        come != found
-            && fit(come) > fit(found)
-            && self.sought(file) == Sought::There(come.to_owned())
+        let [come, found] = [come, found].map(Path::new);
+        self.seeker().fits_better(come, found, file)
     }
 
-    /// Whether the image that was found is the one that a list calls `file`: as long as it is called so, none fits better, and
-    /// it does not fit another one as well.
+    /// See [`Seeker::is_still`].
     pub(super) fn is_still(&self, found: &str, file: &str) -> bool {
-        let is_anothers = || {
-            let found = Path::new(found);
-            let meant = decoded(file);
-            !self.may_be(found, file) && meant.is_none_or(|meant| !self.may_be(found, &meant))
-        };
-        self.is_called(found, file)
-            && match self.sought(file) {
-                Sought::There(path) => !self.fits_better(&path, found, file),
-                Sought::Several(_) | Sought::Missing => !is_anothers(),
-            }
-    }
-
-    /// Whether an image has the name of what a list calls `file`, and there is none at that path; or the name that is meant, and there
-    /// is none of the one that is written.
-    fn is_called(&self, found: &str, file: &str) -> bool {
-        let another_at = |file: &str| {
-            let named = image_path(Path::new(""), file);
-            let named = named.map(|path| path.components().collect::<PathBuf>());
-            named.is_some_and(|named| named != Path::new(found) && self.root.join(named).is_file())
-        };
-        let is_called = |file: &str| base(found) == base(file) && !another_at(file);
-        match decoded(file) {
-            Some(meant) if base(&meant) != base(file) => {
-                let as_meant = || is_called(&meant) && self.sought_as(file) == Sought::Missing;
-                is_called(file) || as_meant()
-            }
-            Some(meant) if another_at(&meant) => {
-                self.sought(file) == Sought::There(found.to_owned())
-            }
-            Some(_) | None => is_called(file),
-        }
+        self.seeker().is_still(Path::new(found), file)
     }
 
     /// What was looked for and is nothing to read, by its name.
@@ -455,6 +306,8 @@ impl Index {
         let path = self.folders[at].path.join(&name);
         if folder {
             if !self.paths.contains_key(&path) {
+                self.ends
+                    .insert(&path.to_string_lossy(), self.folders.len());
                 self.paths.insert(path.clone(), self.folders.len());
                 self.folders.push(Folder {
                     path,
@@ -483,6 +336,25 @@ impl Index {
         }
         // Folders whose names are text hold only such.
         met.extend(path.to_str().map(ToOwned::to_owned));
+    }
+}
+
+impl Files for Index {
+    fn is_there(&self, path: &Path) -> bool {
+        self.root.join(path).is_file()
+    }
+
+    fn called(&self, name: &str, folders: &str) -> impl Iterator<Item = PathBuf> {
+        let hash = key(name);
+        let (first, several) = (self.files.get(&hash), self.several.get(&hash));
+        let whole = several.filter(|_| folders.is_empty());
+        let alike = several.filter(|_| !folders.is_empty()).map(|several| {
+            let ending = self.ends.ending(folders);
+            ending.filter(|folder| several.contains(folder))
+        });
+        let in_folders = { whole.into_iter().flatten() }.chain(alike.into_iter().flatten());
+        let in_folders = in_folders.chain(first.filter(|_| several.is_none()));
+        in_folders.map(move |folder| self.folders[*folder].path.join(name))
     }
 }
 
@@ -523,7 +395,7 @@ mod tests {
         );
         assert!(index.is_whole());
         let mut find = |file: &str| index.find(file);
-        let there = |path: &str| Sought::There(path.to_owned());
+        let there = |path: &str| Sought::There(path.into());
         // Which of two is meant, only their folders can say.
         let several = Sought::Several(["deep/er/a.tif", "z/a.tif"].map(PathBuf::from));
         assert_eq!(find("z/a.tif"), there("z/a.tif"));
@@ -564,7 +436,7 @@ mod tests {
         };
         let mut index = Index::new(folder.path());
         let round = |index: &mut Index| while index.look(&Disk, 99).unwrap().1 == Next::More {};
-        let there = |path: &str| Sought::There(path.to_owned());
+        let there = |path: &str| Sought::There(path.into());
         let listed = ["/scope/s00/r.tif", "/scope/s01/r.tif", "/scope/s%202/r.tif"];
         index.know(
             listed
@@ -609,7 +481,7 @@ mod tests {
             write(file);
         }
         round(&mut index);
-        let there = |path: &str| Sought::There(path.to_owned());
+        let there = |path: &str| Sought::There(path.into());
         for (listed, path) in [
             ("/scope/in/t%231.tif", "in/t#1.tif"),
             ("in/t%231.tif", "in/t#1.tif"),

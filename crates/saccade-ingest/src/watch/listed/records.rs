@@ -107,6 +107,7 @@ impl<F: Folders> ListWatch<F> {
                 continue;
             };
             let path = self.folder.join(&file);
+            let file = file.to_string_lossy().into_owned();
             // Before anything is read: what changes later is seen to have changed.
             let stamp = self.disk.stamp(&path).ok();
             let size = match read_size(&path) {
