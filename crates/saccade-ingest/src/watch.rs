@@ -155,8 +155,8 @@ pub struct Watch<F> {
     blocked: Vec<String>,
     /// Why images cannot be looked at, as it was said last, and of how many more it was not said.
     lost: (Vec<String>, usize),
-    /// Whether each of them is told as it is met.
-    tells_lost: bool,
+    /// Whether each of these is told as it is met.
+    tells_missing: bool,
     held_up: HeldUp,
 }
 
@@ -299,7 +299,7 @@ impl<F: Folders> Watch<F> {
             tells_misfits: false,
             blocked: Vec::new(),
             lost: (Vec::new(), 0),
-            tells_lost: false,
+            tells_missing: false,
             held_up: HeldUp::default(),
         };
         watch.take_over()?;
@@ -363,7 +363,7 @@ impl<F: Folders> Watch<F> {
         Ok(true)
     }
 
-    /// Which images cannot be looked at though their names are there, in words.
+    /// Which images cannot be looked at though their names are there, and where folders of them should be and are not, in words.
     pub fn missing(&self) -> Option<String> {
         const SHOWN: usize = 3;
         let (whys, more) = &self.lost;
@@ -372,7 +372,11 @@ impl<F: Folders> Watch<F> {
             0 => None,
             more => Some(format!("and {more} more such images")),
         };
-        let said: Vec<_> = first.chain(more).collect();
+        let mut blocked: Vec<_> = self.blocked.iter().take(SHOWN).cloned().collect();
+        if let more @ 1.. = self.blocked.len() - blocked.len() {
+            blocked.push(format!("and {more} more such folders"));
+        }
+        let said: Vec<_> = blocked.into_iter().chain(first).chain(more).collect();
         (!said.is_empty()).then(|| said.join("; "))
     }
 
@@ -511,7 +515,7 @@ pub fn run<F: Folders>(
 ) -> Result<u64, WatchError> {
     // Who looks once is told by the caller.
     watch.tells_misfits = !once;
-    watch.tells_lost = !once;
+    watch.tells_missing = !once;
     look_on(watch, once, cancel, |_| false)
 }
 
@@ -530,16 +534,14 @@ impl<F: Folders> Looks for Watch<F> {
             self.tells_misfits = false;
         }
         let blocked = self.scanner.blocked();
-        for why in { blocked.iter() }.filter(|why| !self.blocked.contains(why)) {
-            log::warn!("{why}");
-        }
-        self.blocked = blocked;
         let lost = self.scanner.lost();
-        let is_new = |why: &&String| !self.lost.0.contains(why);
-        for why in { lost.0.iter() }.filter(is_new).filter(|_| self.tells_lost) {
-            log::warn!("{why}");
+        let known = |why: &&String| self.blocked.contains(why) || self.lost.0.contains(why);
+        for why in { blocked.iter() }.chain(&lost.0).filter(|why| !known(why)) {
+            if self.tells_missing {
+                log::warn!("{why}");
+            }
         }
-        self.lost = lost;
+        (self.blocked, self.lost) = (blocked, lost);
         looked
     }
 
@@ -553,7 +555,6 @@ impl<F: Folders> Looks for Watch<F> {
 
     fn waits_for(&self) -> Option<String> {
         let said: Vec<_> = { self.unmatched().into_iter() }
-            .chain(self.blocked.iter().cloned())
             .chain(self.missing())
             .collect();
         (!said.is_empty()).then(|| said.join("; "))

@@ -112,6 +112,9 @@ enum Trouble {
     Empty,
 }
 
+/// Images that are not there of which it is asked why, at most.
+const MOST_ASKED: usize = 64;
+
 /// A folder with a list that is being followed.
 pub struct ListWatch<F> {
     config: ListConfig,
@@ -269,7 +272,8 @@ impl<F: Folders> ListWatch<F> {
     pub fn missing(&self) -> Option<String> {
         const SHOWN: usize = 3;
         let odd = self.index.odd();
-        let (mut absent, mut first_absent, mut strange, mut whys) = (0_usize, None, 0, Vec::new());
+        let (mut absent, mut blocked, mut strange, mut whys) = (0_usize, None, 0, Vec::new());
+        let mut examples = Vec::new();
         for tile in self.missing.difference(&self.unclear) {
             let Some(wanted) = self.tiles.get(tile).and_then(|tile| tile.wanted.as_ref()) else {
                 continue;
@@ -277,8 +281,13 @@ impl<F: Folders> ListWatch<F> {
             let file = &wanted.file;
             let there = names(file).find_map(|name| odd.get(&*name).copied());
             let Some(path) = there.or_else(|| self.index.folder(file)) else {
+                if examples.len() < SHOWN {
+                    examples.push(format!("{file:?}"));
+                }
+                if absent < MOST_ASKED && blocked.is_none() {
+                    blocked = self.index.blocked(file).map(|why| (file, why));
+                }
                 absent += 1;
-                first_absent = first_absent.or(Some(file));
                 continue;
             };
             strange += 1;
@@ -298,13 +307,15 @@ impl<F: Folders> ListWatch<F> {
                 "{strange} of the {all} images that the list names cannot be read: {whys}{more}"
             ));
         }
-        if let Some(file) = first_absent {
-            let blocked = self.index.blocked(file);
-            let blocked = blocked.map(|why| format!(" ({why})"));
+        if absent > 0 {
+            // One of which it can be told why says most.
+            let such_as = match blocked {
+                Some((file, why)) => format!("{file:?} ({why})"),
+                None => examples.join(", "),
+            };
             said.push(format!(
-                "{absent} of the {all} images that the list names are not below {}, such as {file:?}{}",
-                self.folder.display(),
-                blocked.unwrap_or_default()
+                "{absent} of the {all} images that the list names are not below {}, such as {such_as}",
+                self.folder.display()
             ));
         }
         said.extend(self.unclear());
@@ -323,6 +334,14 @@ impl<F: Folders> ListWatch<F> {
         });
         let (file, [one, other]) = of.next()?;
         let (count, all, list) = (self.unclear.len(), self.tiles.len(), &self.config.list);
+        let mut files = [file].into_iter().chain(of.map(|(file, _)| file));
+        let blocked = { files.by_ref().take(MOST_ASKED) }
+            .find_map(|file| Some((file, self.index.blocked(file)?)));
+        if let Some((file, why)) = blocked {
+            return Some(format!(
+                "{count} of the {all} images that the list names are in other folders than it says, such as {file:?} ({why})"
+            ));
+        }
         Some(format!(
             "{count} of the {all} images that the list names are in several folders, such as {file:?}, which may be \
              {one:?} or {other:?}; name them with their folders in the list: {}",
@@ -401,11 +420,16 @@ impl<F: Folders> ListWatch<F> {
             let Some(Tile { wanted, told }) = self.tiles.get(&name) else {
                 continue;
             };
-            match wanted.as_ref().map(|wanted| wanted.image) {
-                Some(Image::Missing) => self.look_for(&name, now),
-                Some(Image::Unread) => {}
+            match wanted.as_ref().map(|wanted| (wanted.image, &wanted.file)) {
+                // There may be as many images of its name as sections.
+                Some((Image::Missing, wanted)) => {
+                    if self.index.may_be(file, wanted) {
+                        self.look_for(&name, now);
+                    }
+                }
+                Some((Image::Unread, _)) => {}
                 // The list has it, or was not read yet.
-                Some(Image::Told) | None => {
+                Some((Image::Told, _)) | None => {
                     let is_it = told.as_ref().is_some_and(|told| told.file == file);
                     let fits_better = |(told, wanted): (&Told, &Wanted)| {
                         self.index.fits_better(file, &told.file, &wanted.file)

@@ -10,6 +10,9 @@ pub(super) fn why(path: &Path) -> Option<String> {
     let at = path.display();
     let is_gone = |e: &io::Error| e.kind() == io::ErrorKind::NotFound;
     match (fs::metadata(path), fs::symlink_metadata(path)) {
+        (Ok(there), _) if there.is_dir() => Some(format!(
+            "a folder lies where an image should be; put the image itself there: {at}"
+        )),
         (Ok(_), _) => None,
         (Err(e), Ok(_)) if is_gone(&e) => Some(format!(
             "a link to nothing lies where an image should be; put there what it leads to, or the image itself: {at}"
@@ -31,16 +34,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn links_that_lead_to_no_image_are_called_by_their_kind() {
+    fn what_is_no_image_is_called_by_its_kind() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         fs::write(at("image"), "").unwrap();
         symlink(at("image"), at("link")).unwrap();
         symlink("none", at("dangling")).unwrap();
         symlink("loop", at("loop")).unwrap();
+        fs::create_dir(at("folder")).unwrap();
+        symlink("folder", at("to-folder")).unwrap();
         for (name, kind) in [
             ("dangling", "a link to nothing lies"),
             ("loop", "a link that cannot be followed lies"),
+            ("folder", "a folder lies"),
+            ("to-folder", "a folder lies"),
         ] {
             let why = why(&at(name)).unwrap();
             assert!(

@@ -279,7 +279,7 @@ impl<F: Folders> Scanner<F> {
         for path in some {
             let whole = self.root.join(&path);
             let stamp = self.folders.stamp(&whole);
-            if stamp.is_err() && no_image::why(&whole).is_some() {
+            if no_image::why(&whole).is_some() {
                 continue;
             }
             // Of one that is gone the folder tells when it comes back.
@@ -296,6 +296,12 @@ impl<F: Folders> Scanner<F> {
         let now = self.folders.now();
         let age = |lost: &Lost| now.duration_since(lost.since);
         { self.lost.values() }.any(|lost| age(lost).is_ok_and(|age| age < SETTLED))
+    }
+
+    /// Notes what lies where an image should be and cannot be looked at.
+    fn lose(&mut self, below: PathBuf, place: Place) {
+        let since = self.folders.now();
+        self.lost.entry(below).or_insert(Lost { place, since });
     }
 
     /// Notes what lies where a folder should be.
@@ -469,6 +475,12 @@ impl<F: Folders> Scanner<F> {
         let count = u64::from(!counted);
         if entry.folder {
             self.counts.folders += count;
+            let as_image = self.pattern.file(&entry.name, place).filter(|_| as_deep);
+            if let Some(place) = as_image {
+                self.counts.fit += 1;
+                self.lose(below, place);
+                return;
+            }
             let Some(place) = self.pattern.folder(*depth, &entry.name, place) else {
                 self.misfit(&below, true, as_deep);
                 return;
@@ -506,10 +518,7 @@ impl<F: Folders> Scanner<F> {
                 self.lost.remove(&below);
                 self.meet(&below, place, stamp, found);
             }
-            Err(_) if no_image::why(&whole).is_some() => {
-                let since = self.folders.now();
-                self.lost.entry(below).or_insert(Lost { place, since });
-            }
+            Err(_) if no_image::why(&whole).is_some() => self.lose(below, place),
             // Gone: the folder is looked through again.
             Err(_) => listing.modified = None,
         }

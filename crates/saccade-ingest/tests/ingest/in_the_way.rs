@@ -227,6 +227,36 @@ fn links_to_no_image_where_names_say_images_are_told_and_not_waited_for() {
     assert_eq!(beside.told().len(), 2);
 }
 
+/// A folder that is called as an image is none, nor is a file that is called as a folder of them.
+#[test]
+fn what_names_say_and_is_of_another_kind_is_missing_to_who_looks_once() {
+    let beside = Beside::new();
+    beside.folder("s0", "r0_c0.tif", 1);
+    fs::create_dir(beside.at("s0/r0_c1.tif")).unwrap();
+    fs::write(beside.at("s0/r0_c1.tif/0.tif"), "of another").unwrap();
+    fs::write(beside.at("s1"), "no folder").unwrap();
+    let watch = look_once(&beside);
+    let missing = watch.missing().unwrap();
+    let root = beside.at("").canonicalize().unwrap();
+    for (why, file) in [
+        ("a folder lies where an image should be", "s0/r0_c1.tif"),
+        ("in a folder where a file lies", "s1"),
+    ] {
+        let at = root.join(file).display().to_string();
+        let said = { missing.split("; ") }.any(|said| said.contains(why));
+        assert!(said && missing.contains(&at), "{missing}");
+    }
+    assert_eq!(beside.told(), BTreeSet::from(["s0_r0_c0".to_owned()]));
+    drop(watch);
+
+    fs::remove_dir_all(beside.at("s0/r0_c1.tif")).unwrap();
+    fs::write(beside.at("s0/r0_c1.tif"), tiff8(SIZE, &texture(SIZE, 2))).unwrap();
+    fs::remove_file(beside.at("s1")).unwrap();
+    beside.folder("s1", "r0_c0.tif", 3);
+    assert_eq!(look_once(&beside).missing(), None);
+    assert_eq!(beside.told().len(), 3);
+}
+
 /// Its folder does not change when what the link leads to comes.
 #[test]
 fn what_a_link_in_an_images_place_leads_to_is_told_of_once_it_comes() {
@@ -252,13 +282,10 @@ fn what_a_link_in_an_images_place_leads_to_is_told_of_once_it_comes() {
     until("nothing to wait for", || why().is_none().then_some(()));
 }
 
-#[test]
-fn what_lies_where_a_list_says_folders_is_told() {
-    let beside = Beside::new();
-    beside.folder("s0", "a.tif", 1);
-    pipe(&beside.at("s1"));
+/// Follows a list.
+fn listed(beside: &Beside, lines: &str) -> ListWatch<Disk> {
     let list = beside.at("list.txt");
-    fs::write(&list, "s0/a.tif 0 0 0\ns1/b.tif 0 0 1\n").unwrap();
+    fs::write(&list, lines).unwrap();
     let config = ListConfig {
         list,
         name: VOLUME.to_owned(),
@@ -275,7 +302,47 @@ fn what_lies_where_a_list_says_folders_is_told() {
         drop_after: Duration::ZERO,
         budget: 30,
     };
-    let mut watch = ListWatch::open(config, Disk, &beside.at(""), &beside.kept()).unwrap();
+    ListWatch::open(config, Disk, &beside.at(""), &beside.kept()).unwrap()
+}
+
+/// Also where other images are called alike, in two folders or in those that the list names.
+#[test]
+fn what_lies_where_a_list_says_folders_is_told_before_others_are_offered() {
+    for lines in [
+        "s0/a.tif 0 0 0\ns1/b.tif 0 0 1\n",
+        "s0/a.tif 0 0 0\nzz/b.tif 0 0 0\ns1/b.tif 0 0 1\n",
+    ] {
+        let beside = Beside::new();
+        beside.folder("s0", "a.tif", 1);
+        for (folder, seed) in [("x0", 2), ("x1", 3)] {
+            beside.folder(folder, "b.tif", seed);
+        }
+        pipe(&beside.at("s1"));
+        let mut watch = listed(&beside, lines);
+        follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+        let missing = watch.missing().unwrap();
+        let blocked = "where a named pipe lies; put the folder itself there";
+        for said in ["s1/b.tif", blocked] {
+            assert!(missing.contains(said), "{missing}");
+        }
+        assert!(!missing.contains("name them"), "{missing}");
+        fs::remove_file(beside.at("s1")).unwrap();
+        beside.folder("s1", "b.tif", 2);
+        follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+        assert!(
+            !watch
+                .missing()
+                .is_some_and(|missing| missing.contains("s1"))
+        );
+    }
+}
+
+#[test]
+fn what_lies_where_a_list_says_folders_is_told() {
+    let beside = Beside::new();
+    beside.folder("s0", "a.tif", 1);
+    pipe(&beside.at("s1"));
+    let mut watch = listed(&beside, "s0/a.tif 0 0 0\ns1/b.tif 0 0 1\n");
     let mut once = || {
         follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
         watch.missing()

@@ -110,6 +110,29 @@ async fn names_say_the_channel_and_the_order_of_the_list_theirs() {
     assert_eq!(scope.records().len(), told);
 }
 
+/// Where a list names images as parts of URLs, so it does channels.
+#[tokio::test]
+async fn channels_are_named_as_they_are_meant() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    for (seed, name) in (1..).zip(["in SE/a", "in SE/b", "BSE %/a"]) {
+        scope.image(name, seed);
+    }
+    write(
+        &list,
+        "/far/in%20SE/a.tif 0 0 0\n/far/in SE/b.tif 50 0 0\n/far/BSE%20%25/a.tif 0 0 0\n",
+    );
+    let config = ListConfig {
+        channel_in: Some(Pattern::of_channels("{channel}/{}.tif").unwrap()),
+        ..roomy(&list)
+    };
+    let archive = archive(&scope.0.path().join("archive")).await;
+    scope.once(config, &archive).await;
+    let info = AcquisitionInfo::read(&scope.kept()).unwrap();
+    assert_eq!(info.channels, ["in SE", "BSE %"]);
+    assert_eq!(channels(&archive).await.len(), 3);
+}
+
 /// Fiji registers one channel, and the others were imaged at the same places.
 #[tokio::test]
 async fn what_registration_does_not_know_goes_with_the_channel_that_it_knows() {
