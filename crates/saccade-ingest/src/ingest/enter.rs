@@ -137,8 +137,16 @@ impl Enter<'_> {
                 done.lost.push(*position);
                 continue;
             }
-            done.apply(&mut commit, outcome, self.archive.catalog().clock().now())
-                .await?;
+            if let Outcome::Quarantine { what, pyramid } = outcome
+                && let Some(tile) = &what.tile
+                && commit.has_newer(tile, *position).await?
+            {
+                // What became of its image is no matter any more.
+                done.orphans.extend(pyramid.clone());
+            } else {
+                let now = self.archive.catalog().clock().now();
+                done.apply(&mut commit, outcome, now).await?;
+            }
             if !matches!(outcome, Outcome::Wait { .. }) {
                 commit.wait_no_more(*position).await?;
             }

@@ -1,13 +1,14 @@
 //! Bad input: each kind is told apart, named with its file, and stops nothing.
 
 use std::fs;
+use std::time::Duration;
 
 use glam::UVec2;
 use saccade_archive::acquisition::{Record, RecordReader, TileRecord};
 use saccade_archive::catalog::Quarantined;
 use saccade_core::transform::SectionFromTile;
 use saccade_ingest::Cancel;
-use saccade_ingest::ingest::run;
+use saccade_ingest::ingest::{IngestOptions, run};
 
 use crate::scope::{
     Diary, EXTENT, Scope, VOLUME, archive, at, move_record, orphans, pixels, quick, seen, texture,
@@ -48,6 +49,55 @@ async fn refused(bad: impl FnOnce(&Scope)) -> Quarantined {
         quarantined
     );
     quarantined.remove(0)
+}
+
+/// Which of the two records is looked at last is chance.
+#[tokio::test]
+async fn an_image_that_is_shown_is_not_set_aside_for_an_older_record() {
+    for round in 0..8 {
+        let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+        let archive = archive(folder.path()).await;
+        // Found before it was whole, of a size that nobody knew.
+        fs::write(scope.file("a"), "").unwrap();
+        scope.say(&tile_record("a", 0, UVec2::ONE));
+        let options = IngestOptions {
+            once: false,
+            patience: 2000,
+            ..quick()
+        };
+        let cancel = Cancel::new();
+        let take_in = run(scope.path(), &archive, &options, &(), &cancel);
+        let mend = async {
+            let waits = async || {
+                archive
+                    .catalog()
+                    .queued(VOLUME)
+                    .await
+                    .is_ok_and(|q| q.1 == 1)
+            };
+            until(waits).await;
+            fs::write(scope.file("part"), tiff8(SIZE, &texture(SIZE, 1))).unwrap();
+            scope.say(&tile_record("a", 0, SIZE));
+            fs::rename(scope.file("part"), scope.file("a")).unwrap();
+            until(async || archive.catalog().queued(VOLUME).await.unwrap() == (0, 0)).await;
+            until(async || !seen(&archive).await.is_empty()).await;
+            cancel.cancel();
+        };
+        futures::join!(async { take_in.await.unwrap() }, mend);
+        let set_aside = archive.catalog().quarantined(VOLUME).await.unwrap();
+        assert!(set_aside.is_empty(), "{round}: {set_aside:?}");
+        assert!(orphans(&archive).await.is_empty());
+    }
+}
+
+async fn until(is_so: impl AsyncFn() -> bool) {
+    for _ in 0..2000 {
+        if is_so().await {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    panic!("it does not come");
 }
 
 fn says(what: &Quarantined, words: &[&str]) {

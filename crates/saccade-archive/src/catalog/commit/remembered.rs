@@ -50,6 +50,16 @@ impl Commit<'_> {
         Ok(())
     }
 
+    /// Whether a later record than that at `position` says what a tile's image is, or that there is none.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn has_newer(&mut self, tile: &str, position: u64) -> Result<bool, CatalogError> {
+        let existing = self.existing(tile).await?;
+        Ok(existing.is_some_and(|existing| existing.position > position))
+    }
+
     /// Notes a file or record that could not become a tile.
     ///
     /// # Errors
