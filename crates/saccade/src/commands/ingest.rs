@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
-use saccade_archive::acquisition::AcquisitionInfo;
+use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
 use saccade_archive::catalog::Catalog;
 use saccade_archive::clock::{Clock as _, SystemClock};
 use saccade_archive::pyramid::{Encoding, PyramidIndex};
@@ -34,7 +34,7 @@ pub(crate) struct Ingest {
     #[command(flatten)]
     archive: Archive,
 
-    /// End once everything that is there is done, instead of following; with 3 if anything was set aside, or images of a
+    /// End once everything that is there is done, instead of following; with 3 while images are set aside, or if records were, or images of a
     /// list are missing
     #[arg(long)]
     once: bool,
@@ -135,24 +135,33 @@ fn first<T>(all: &[T], say: impl Fn(&T) -> String) -> String {
     words.join("; ")
 }
 
-/// What was set aside by this run, and what still waits.
+/// Says what is set aside, and what still waits. How many images are: records that made no sense are past.
 async fn say_what_is_left(
     catalog: &Catalog,
     volume: &str,
     quarantined: u64,
     watched: bool,
-) -> Result<()> {
-    if quarantined > 0 {
-        let all = catalog.quarantined(volume).await?;
-        let before = all.len().saturating_sub(usize::try_from(quarantined)?);
-        let named = first(&all[before..], |one| match &one.tile {
+) -> Result<usize> {
+    let all = catalog.quarantined(volume).await?;
+    let before = all.len().saturating_sub(usize::try_from(quarantined)?);
+    let status = format!("/v/{volume}/status.json of `saccade serve`");
+    let parts = [
+        (
+            &all[..before],
+            format!("set aside before, for reasons told by {status}"),
+        ),
+        (
+            &all[before..],
+            format!("set aside, for reasons told above and by {status}"),
+        ),
+    ];
+    for (part, what) in parts {
+        let named = first(part, |one| match &one.tile {
             Some(tile) => format!("{} (tile {tile})", one.file),
             None => one.file.clone(),
         });
         if !named.is_empty() {
-            say(&format!(
-                "set aside, for reasons told above and by /v/{volume}/status.json of `saccade serve`: {named}"
-            ));
+            say(&format!("{what}: {named}"));
         }
     }
     let waiting = catalog.waiting(volume).await?;
@@ -170,7 +179,8 @@ async fn say_what_is_left(
             "{count} unfinished, taken up when it is started again: {named}"
         ));
     }
-    Ok(())
+    let images = all.iter().filter(|one| one.file != RecordReader::FILE);
+    Ok(images.count())
 }
 
 /// Where what is found in folders without records is kept.
@@ -437,11 +447,13 @@ impl Ingest {
                 .ok()
                 .map(|info| info.name),
         };
-        if let Some(volume) = volume
-            && let watched = options.linked.is_some()
-            && let Err(e) = say_what_is_left(archive.catalog(), &volume, quarantined, watched).await
-        {
-            log::warn!("what is left cannot be told: {e}");
+        let mut set_aside = usize::try_from(quarantined)?;
+        if let Some(volume) = volume {
+            let watched = options.linked.is_some();
+            match say_what_is_left(archive.catalog(), &volume, quarantined, watched).await {
+                Ok(images) => set_aside = set_aside.max(images),
+                Err(e) => log::warn!("what is left cannot be told: {e}"),
+            }
         }
         archive.catalog().close().await;
         let mut done = format!("{tiles} tiles taken in, {moved} moved, {quarantined} set aside");
@@ -457,7 +469,7 @@ impl Ingest {
                 "{missing}; they are taken in when it is started again"
             ));
         }
-        let all = !self.once || (quarantined == 0 && missing.is_none());
+        let all = !self.once || (set_aside == 0 && missing.is_none());
         Ok(if all {
             ExitCode::SUCCESS
         } else {

@@ -124,7 +124,7 @@ fn a_pipe_in_the_place_of_a_folder_of_images_is_told_once() {
     let once = run(&[&ingest[..], &["--once"]].concat());
     ended(
         &once,
-        0,
+        3,
         &["1 tiles taken in", "a named pipe", text(&second)],
     );
     let following = Program::start_with(&ingest, &[]);

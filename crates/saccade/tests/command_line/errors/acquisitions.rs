@@ -195,9 +195,18 @@ fn bad_tiles_are_set_aside_and_told() {
         assert!(said.contains(part), "{part:?} is not in: {said}");
     }
 
-    // What is done is done.
+    // What is done is done, and images that are set aside are still not in the volume.
     let again = run(["ingest", text(&acquisition), text(&archive), "--once"]);
-    assert!(again.status.success(), "{}", stderr(&again));
+    let said = stderr(&again);
+    assert_eq!(again.status.code(), Some(3), "{said}");
+    for part in [
+        "set aside before",
+        "torn.png",
+        "0 tiles taken in",
+        "0 set aside",
+    ] {
+        assert!(said.contains(part), "{part:?} is not in: {said}");
+    }
     let (_server, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
