@@ -31,6 +31,14 @@ pub trait Files {
     /// Where files of a name may lie, below the root: at least all that lie in folders whose last parts are `folders`, such as
     /// `s01/raw`; all of them where that is empty.
     fn called(&self, name: &str, folders: &str) -> impl Iterator<Item = PathBuf>;
+
+    /// Whether a folder lies at a path below the root.
+    fn is_folder(&self, path: &Path) -> bool;
+
+    /// Whether an image that lies elsewhere can be what a list calls `file`, as far as its path alone tells.
+    fn can_be(&self, _path: &Path, _file: &str) -> bool {
+        true
+    }
 }
 
 /// Which images a list names, as far as that tells whether one that lies elsewhere can be another one's.
@@ -39,7 +47,12 @@ pub struct Mentions {
     /// How many images end in a name, or in a name with folders before it, by the hash of that. With folders only where several
     /// have the name.
     ends: HashMap<u64, u32>,
+    /// Some images of each folder that the list names, by the folder's hash.
+    folders: HashMap<u64, Vec<String>>,
 }
+
+/// Images of a folder that are looked for, to know which one it is.
+const MOST_SIBLINGS: usize = 8;
 
 /// The hash by which a name or path is known.
 pub fn key(name: &str) -> u64 {
@@ -78,6 +91,14 @@ impl<T> Ends<T> {
 fn from_its_end(path: &str) -> String {
     let parts = path.rsplit('/').filter(|part| !part.is_empty());
     parts.flat_map(|part| [part, "/"]).collect()
+}
+
+/// The folder that a list names for an image, in one spelling; `None` if it names none.
+fn folder_of(file: &str) -> Option<String> {
+    let parts = file.split(['/', '\\']);
+    let parts: Vec<_> = parts.filter(|part| !matches!(*part, "" | ".")).collect();
+    let (_, folders) = parts.split_last()?;
+    (!folders.is_empty()).then(|| folders.join("/"))
 }
 
 /// How many folders two paths have in common from their ends on.
@@ -129,7 +150,17 @@ impl Mentions {
                 *ends.entry(tail).or_default() += 1;
             }
         }
-        Self { ends }
+        let mut folders: HashMap<u64, Vec<String>> = HashMap::new();
+        for file in &files {
+            let of = spellings(file).filter_map(|spelling| folder_of(&spelling));
+            for folder in of.collect::<BTreeSet<_>>() {
+                let siblings = folders.entry(key(&folder)).or_default();
+                if siblings.len() < MOST_SIBLINGS {
+                    siblings.push(base(file).to_owned());
+                }
+            }
+        }
+        Self { ends, folders }
     }
 
     /// Whether several images end so.
@@ -155,9 +186,9 @@ pub struct Seeker<'a, F> {
 }
 
 impl<F: Files> Seeker<'_, F> {
-    /// The image that a list calls `file`: at that path, else by name alone. Of several of that name the one whose
-    /// folders are most like those that the list names; none, if that could be several, or if it is as much like another one that the
-    /// list names. If there is none, the same of what `file` means [`decoded`].
+    /// The image that a list calls `file`: at that path, else by its name. Of several of that name the one whose
+    /// folders are most like those that the list names; none, if that could be several, if it is as much like another one that the
+    /// list names, or if it is [stray](Self::is_stray). If there is none, the same of what `file` means [`decoded`].
     pub fn sought(&self, file: &str) -> Sought {
         let as_written = self.sought_as(file);
         let Some(decoded) = decoded(file) else {
@@ -184,7 +215,7 @@ impl<F: Files> Seeker<'_, F> {
             return Sought::Missing;
         }
         let most = (1..=MOST_FOLDERS).take_while(|folders| tail(file, *folders).is_some());
-        for folders in (0..=most.last().unwrap_or(0)).rev() {
+        for folders in (self.at_home(file)..=most.last().unwrap_or(0)).rev() {
             let Some(end) = tail(file, folders).filter(|end| !self.mentions.several(end)) else {
                 continue;
             };
@@ -193,6 +224,7 @@ impl<F: Files> Seeker<'_, F> {
             let alike = called.map(|path| (likeness(&path, file), path));
             let mut paths: Vec<(usize, PathBuf)> = alike
                 .filter(|(like, path)| *like >= folders && self.mentions.may_be(path, file))
+                .filter(|(_, path)| self.files.can_be(path, file))
                 .filter(|(_, path)| self.files.is_there(path))
                 .collect();
             // Those that are more alike were none, unless there are more folders than are compared.
@@ -210,6 +242,35 @@ impl<F: Files> Seeker<'_, F> {
         Sought::Missing
     }
 
+    /// How many folders an image that lies elsewhere has in common at least with what a list calls `file`: as many as are
+    /// sure to be its own, since there is a folder at that path, or others of the list lie in it. What is in none such is late.
+    fn at_home(&self, file: &str) -> usize {
+        let Some(folder) = folder_of(file) else {
+            return 0;
+        };
+        let count = folder.split('/').count().min(MOST_FOLDERS);
+        let named = image_path(Path::new(""), file);
+        let named = named.as_deref().and_then(Path::parent);
+        let named = named.filter(|named| !named.as_os_str().is_empty());
+        if named.is_some_and(|named| self.files.is_folder(named)) {
+            return count;
+        }
+        let siblings = self.mentions.folders.get(&key(&folder));
+        let siblings = siblings.into_iter().flatten();
+        let others = siblings.filter(|name| !names(name).any(|name| name == base(file)));
+        let siblings: Vec<String> = others.flat_map(|name| names(name)).collect();
+        let are_there = |folders: &usize| {
+            let end = tail(&folder, folders - 1).unwrap_or_default();
+            siblings.iter().any(|name| {
+                let sibling = format!("{folder}/{name}");
+                let mut called = self.files.called(name, &end);
+                called
+                    .any(|path| likeness(&path, &sibling) >= *folders && self.files.is_there(&path))
+            })
+        };
+        (1..=count).rev().find(are_there).unwrap_or(0)
+    }
+
     /// The image at the path that a list calls `file`.
     fn exactly(&self, file: &str) -> Option<PathBuf> {
         let named = image_path(Path::new(""), file)?;
@@ -217,12 +278,13 @@ impl<F: Files> Seeker<'_, F> {
         is_there.then(|| named.components().collect())
     }
 
-    /// Whether an image can be what a list calls `file`, whatever else is there. No file is asked for.
+    /// Whether an image can be what a list calls `file`, as far as that can be told without looking at any file.
     pub fn may_be(&self, path: &Path, file: &str) -> bool {
         let may_be = |file: &str| {
             let named = image_path(Path::new(""), file);
             let is_exact = named.is_some_and(|named| named.components().eq(path.components()));
-            is_named(path, file) && (is_exact || self.mentions.may_be(path, file))
+            let can_be = || self.mentions.may_be(path, file) && self.files.can_be(path, file);
+            is_named(path, file) && (is_exact || can_be())
         };
         may_be(file) || decoded(file).is_some_and(|meant| may_be(&meant))
     }
@@ -243,16 +305,22 @@ impl<F: Files> Seeker<'_, F> {
     /// Whether the image that was found is the one that a list calls `file`: as long as it is called so, none fits better, and
     /// it does not fit another one as well.
     pub fn is_still(&self, found: &Path, file: &str) -> bool {
-        let is_anothers = || {
-            let meant = decoded(file);
-            let may_be = |file: &str| self.mentions.may_be(found, file);
-            !may_be(file) && meant.is_none_or(|meant| !may_be(&meant))
-        };
         self.is_called(found, file)
             && match self.sought(file) {
                 Sought::There(path) => !self.fits_better(&path, found, file),
-                Sought::Several(_) | Sought::Missing => !is_anothers(),
+                Sought::Several(_) | Sought::Missing => {
+                    self.may_be(found, file) && !self.is_stray(found, file)
+                }
             }
+    }
+
+    /// Whether an image is surely none that a list calls `file`: its path says so, or it is not in the folder that the list names,
+    /// and that is there.
+    pub fn is_stray(&self, path: &Path, file: &str) -> bool {
+        let is_stray = |file: &str| {
+            likeness(path, file) < self.at_home(file) || !self.files.can_be(path, file)
+        };
+        is_stray(file) && decoded(file).is_none_or(|meant| is_stray(&meant))
     }
 
     /// Whether an image has the name of what a list calls `file`, and there is none at that path; or the name that is meant, and there
@@ -359,6 +427,10 @@ impl Images {
 impl Files for Images {
     fn is_there(&self, path: &Path) -> bool {
         self.root.join(path).is_file()
+    }
+
+    fn is_folder(&self, path: &Path) -> bool {
+        self.root.join(path).is_dir()
     }
 
     fn called(&self, name: &str, folders: &str) -> impl Iterator<Item = PathBuf> {
@@ -519,8 +591,9 @@ mod tests {
             ("in/t%231.tif", "in/t#1.tif"),
             ("/scope/%C3%BC.tif", "in/ü.tif"),
             ("/scope/50%25.tif", "in/50%.tif"),
-            // As it is, also elsewhere, before what it means.
-            ("in/both%201.tif", "other/both%201.tif"),
+            // As it is, also elsewhere, before what it means; but not where the folder that is named is there.
+            ("/scope/in/both%201.tif", "other/both%201.tif"),
+            ("in/both%201.tif", "in/both 1.tif"),
             ("/scope/100%2525.tif", "in/100%2525.tif"),
             // Where only the folder is encoded, it tells which one is meant.
             ("in/a%20b/same.tif", "in/a b/same.tif"),

@@ -136,7 +136,7 @@ pub struct ListWatch<F> {
     records: Option<List>,
     tiles: BTreeMap<Arc<str>, Tile>,
     /// Which tiles may have images of a name, by its hash.
-    by_name: HashMap<u64, Vec<Arc<str>>>,
+    by_name: HashMap<u64, BTreeSet<Arc<str>>>,
     /// Tiles whose image was not found.
     missing: BTreeSet<Arc<str>>,
     /// When one of them came last.
@@ -204,7 +204,7 @@ impl<F: Folders> ListWatch<F> {
         let now = disk.now();
         let mut watch = Self {
             once: false,
-            index: Index::new(&folder),
+            index: Index::new(&folder).of_channels(config.channel_in.clone()),
             files: Files::new(&config.list),
             trouble: None,
             adopted: frame.as_ref().and_then(|_| frame::adopted(&folder, kept)),

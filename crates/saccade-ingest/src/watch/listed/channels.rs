@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use saccade_archive::acquisition::tile_list::decoded;
 
+use super::super::Pattern;
 use super::source::{Listing, Named};
 use super::{ListConfig, ListError};
 use crate::replay::lists::channel_names;
@@ -27,6 +28,13 @@ impl Unfit {
     }
 }
 
+/// The channel that a name says, or why it says none.
+pub(super) fn channel_of(pattern: &Pattern, file: &str) -> Result<String, String> {
+    // Part of a URL means what it is decoded.
+    let meant = decoded(file).and_then(|file| pattern.channel(&file).ok());
+    meant.map_or_else(|| pattern.channel(file), Ok)
+}
+
 impl Listing {
     /// The channels that it names, in the order in which it does.
     pub(super) fn channels(&self) -> Vec<String> {
@@ -45,9 +53,7 @@ impl Listing {
             if tile.channel.is_some() {
                 return true;
             }
-            // Part of a URL means what it is decoded.
-            let meant = decoded(&tile.file).and_then(|file| pattern.channel(&file).ok());
-            match meant.map_or_else(|| pattern.channel(&tile.file), Ok) {
+            match channel_of(pattern, &tile.file) {
                 Ok(channel) => {
                     tile.channel = Some(channel);
                     true

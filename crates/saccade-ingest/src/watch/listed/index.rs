@@ -16,7 +16,8 @@ pub(super) use saccade_archive::acquisition::listed_images::{Sought, key, names}
 pub(super) use saccade_archive::acquisition::tile_list::base;
 use saccade_archive::acquisition::tile_list::decoded;
 
-use super::super::{Entry, Folders, Next, no_folder};
+use super::super::{Entry, Folders, Next, Pattern, no_folder};
+use super::channels::channel_of;
 
 /// A folder's time counts only once it is this old: file systems stamp coarsely.
 const SETTLED: Duration = Duration::from_secs(3);
@@ -53,6 +54,8 @@ pub(super) struct Index {
     /// Files that may be projects of TrakEM2, below the root.
     projects: BTreeSet<PathBuf>,
     mentions: Mentions,
+    /// How names say the channel, if they do.
+    channel_in: Option<Pattern>,
     /// What was looked for and is nothing to read, below the root.
     odd: BTreeSet<PathBuf>,
     /// Which of them was looked at again last.
@@ -92,10 +95,19 @@ impl Index {
             several: HashMap::new(),
             projects: BTreeSet::new(),
             mentions: Mentions::default(),
+            channel_in: None,
             odd: BTreeSet::new(),
             odd_at: PathBuf::new(),
             changed: false,
             went_round: false,
+        }
+    }
+
+    /// Takes images only for those that show the same channel, as far as names say so.
+    pub(super) fn of_channels(self, pattern: Option<Pattern>) -> Self {
+        Self {
+            channel_in: pattern,
+            ..self
         }
     }
 
@@ -159,6 +171,11 @@ impl Index {
         for folder in &mut self.folders {
             folder.listed = None;
         }
+    }
+
+    /// See [`Seeker::is_stray`].
+    pub(super) fn is_stray(&self, path: &str, file: &str) -> bool {
+        self.seeker().is_stray(Path::new(path), file)
     }
 
     /// See [`Seeker::may_be`].
@@ -340,6 +357,20 @@ impl Index {
 }
 
 impl Files for Index {
+    fn is_folder(&self, path: &Path) -> bool {
+        self.paths.contains_key(path) && self.root.join(path).is_dir()
+    }
+
+    /// Where names say the channel, an image does not show another one.
+    fn can_be(&self, path: &Path, file: &str) -> bool {
+        let Some(pattern) = &self.channel_in else {
+            return true;
+        };
+        let of = |file: &str| channel_of(pattern, file);
+        let channels = of(&path.to_string_lossy()).ok().zip(of(file).ok());
+        channels.is_none_or(|(one, other)| one == other)
+    }
+
     fn is_there(&self, path: &Path) -> bool {
         self.root.join(path).is_file()
     }
@@ -506,21 +537,25 @@ mod tests {
         // One that is called as it is written comes later, and wherever it is.
         write("far/t%231.tif");
         round(&mut index);
-        for listed in ["in/t%231.tif", "/scope/in/t%231.tif"] {
-            assert_eq!(index.find(listed), there("far/t%231.tif"));
-            assert!(index.is_still("far/t%231.tif", listed));
-            assert!(!index.is_still("in/t#1.tif", listed));
-        }
+        let listed = "/scope/in/t%231.tif";
+        assert_eq!(index.find(listed), there("far/t%231.tif"));
+        assert!(index.is_still("far/t%231.tif", listed));
+        assert!(!index.is_still("in/t#1.tif", listed));
+        // Where the folder that is named is there, it is that one's.
+        assert_eq!(index.find("in/t%231.tif"), there("in/t#1.tif"));
+        assert!(index.is_still("in/t#1.tif", "in/t%231.tif"));
+        assert!(!index.is_still("far/t%231.tif", "in/t%231.tif"));
         // What it means is found again when that is gone, and what becomes of either is noticed.
         fs::remove_file(folder.path().join("far/t%231.tif")).unwrap();
-        assert_eq!(index.find("in/t%231.tif"), there("in/t#1.tif"));
+        assert_eq!(index.find(listed), there("in/t#1.tif"));
         fs::rename(
             folder.path().join("in/t#1.tif"),
             folder.path().join("t#1.tif"),
         )
         .unwrap();
-        assert_eq!(index.find("in/t%231.tif"), Sought::Missing);
+        assert_eq!(index.find(listed), Sought::Missing);
         round(&mut index);
-        assert_eq!(index.find("in/t%231.tif"), there("t#1.tif"));
+        assert_eq!(index.find(listed), there("t#1.tif"));
+        assert_eq!(index.find("in/t%231.tif"), Sought::Missing);
     }
 }

@@ -13,7 +13,7 @@ use saccade_core::transform::SectionFromTile;
 
 use super::super::{BEFORE_FIRST, Folders};
 use super::frame::Frame;
-use super::index::{key, names};
+use super::index::{Sought, base, key, names};
 use super::source::{self, Listing, State, adopt, offset, raw, solution_again};
 use super::{Image, ListError, ListWatch, Tile, Trouble, Wanted, frame};
 use crate::replay::RawTile;
@@ -307,9 +307,7 @@ impl<F: Folders> ListWatch<F> {
             let name: Arc<str> = named.name.into();
             for image in names(&named.file) {
                 let tiles = self.by_name.entry(key(&image)).or_default();
-                if !tiles.contains(&name) {
-                    tiles.push(Arc::clone(&name));
-                }
+                tiles.insert(Arc::clone(&name));
             }
             let tile = self.tiles.entry(Arc::clone(&name)).or_default();
             let image = match &mut tile.told {
@@ -349,6 +347,7 @@ impl<F: Folders> ListWatch<F> {
                 *unread = before;
             }
         }
+        self.give_back();
         let untold = &mut self.untold;
         self.tiles.retain(|name, tile| {
             if tile.wanted.is_none() && tile.told.is_some() {
@@ -360,6 +359,44 @@ impl<F: Folders> ListWatch<F> {
         if self.missing_said.is_some() {
             self.missing_said = self.missing();
         }
+    }
+}
+
+impl<F: Folders> ListWatch<F> {
+    /// Takes away the tiles whose own image is not there and which show another's, or one that is surely not theirs: the list
+    /// did not name that one's tile when it was taken, or the folder of their own was not there yet.
+    fn give_back(&mut self) {
+        let told = { self.tiles.iter() }.filter_map(|(name, tile)| {
+            let wanted = { tile.wanted.as_ref() }.filter(|wanted| wanted.image == Image::Missing);
+            Some((name, &wanted?.file, &tile.told.as_ref()?.file))
+        });
+        let wrong = told.filter(|(_, wanted, told)| {
+            self.folder.join(told).is_file()
+                && (self.index.is_stray(told, wanted) || self.is_anothers(told, wanted))
+        });
+        let wrong: Vec<Arc<str>> = wrong.map(|(name, ..)| Arc::clone(name)).collect();
+        for name in wrong {
+            if let Some(tile) = self.tiles.get_mut(&name) {
+                let told = tile.told.take();
+                let (tile, file) = (name.to_string(), told.map_or_else(String::new, |t| t.file));
+                log::warn!(
+                    "tile {tile} showed {file:?}, which is not its image, and is taken away until that comes"
+                );
+                self.untold
+                    .push_back((Record::Delete(DeleteRecord { tile }), None));
+            }
+        }
+    }
+
+    /// Whether an image is what the list calls by other words than `file`.
+    fn is_anothers(&self, image: &str, file: &str) -> bool {
+        let tiles = self.by_name.get(&key(base(image)));
+        let others = { tiles.into_iter().flatten() }.filter_map(|tile| {
+            let wanted = self.tiles.get(tile)?.wanted.as_ref()?;
+            (wanted.file != file && self.index.may_be(image, &wanted.file)).then_some(wanted)
+        });
+        let there = Sought::There(image.into());
+        { others }.any(|other| self.index.sought(&other.file) == there)
     }
 }
 

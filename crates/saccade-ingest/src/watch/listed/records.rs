@@ -48,9 +48,7 @@ impl<F: Folders> ListWatch<F> {
                         };
                         let name: Arc<str> = tile.tile.into();
                         let names = self.by_name.entry(key(base(&told.file))).or_default();
-                        if !names.contains(&name) {
-                            names.push(Arc::clone(&name));
-                        }
+                        names.insert(Arc::clone(&name));
                         self.tiles.entry(name).or_default().told = Some(told);
                     }
                     Record::Transform(TransformRecord { tile, transform }) => {

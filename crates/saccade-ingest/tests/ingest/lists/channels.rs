@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 
 use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::{AcquisitionInfo, ChannelRef, Record};
+use saccade_ingest::Cancel;
 use saccade_ingest::replay::{Input, detect};
-use saccade_ingest::watch::{ListConfig, Pattern};
+use saccade_ingest::watch::{ListConfig, Pattern, Until, follow};
 
 use super::{SIZE, Scope, config, roomy, write};
 use crate::scope::{VOLUME, archive, seen};
@@ -108,6 +109,59 @@ async fn names_say_the_channel_and_the_order_of_the_list_theirs() {
         "{refused}"
     );
     assert_eq!(scope.records().len(), told);
+}
+
+/// Channels' images are called alike, each in a folder of its own.
+#[tokio::test]
+async fn an_image_that_is_late_shows_no_other_channel() {
+    for before in ["", "pictures/", "/far/"] {
+        let scope = Scope::new();
+        let list = scope.file("list.txt");
+        for (seed, name) in (1..).zip(["BSE/r0", "BSE/r1", "SE/r0"]) {
+            scope.image(name, seed);
+        }
+        let line = |file: &str, z: u32| format!("{before}{file}.tif 0 0 {z}\n");
+        let se = line("SE/r0", 0) + &line("SE/r1", 1);
+        write(&list, &se);
+        let config = || ListConfig {
+            channel_in: Some(Pattern::of_channels("{channel}/{}.tif").unwrap()),
+            channels: Some(vec!["SE".to_owned(), "BSE".to_owned()]),
+            ..roomy(&list)
+        };
+        let archive = archive(&scope.0.path().join("archive")).await;
+        let watch = scope.once(config(), &archive).await;
+        assert_eq!(channels(&archive).await, of(&[("r0", 0)]), "{before}");
+        assert!(watch.missing().unwrap().contains("SE/r1"));
+        drop(watch);
+        write(&list, se + &line("BSE/r0", 0) + &line("BSE/r1", 1));
+        drop(scope.once(config(), &archive).await);
+        assert_eq!(channels(&archive).await.len(), 3, "{before}");
+        scope.image("SE/r1", 4);
+        drop(scope.once(config(), &archive).await);
+        let all = channels(&archive).await;
+        let per_channel = [0, 1].map(|c| all.values().filter(|of| **of == c).count());
+        assert_eq!(per_channel, [2, 2], "{before}");
+    }
+}
+
+/// Names that say another channel are none of it, also where nothing else tells.
+#[tokio::test]
+async fn an_image_of_another_channel_is_not_taken_wherever_it_lies() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    scope.image("BSE/r0", 1);
+    write(&list, "/far/SE/r0.tif 0 0 0\n/far/BSE/q.tif 0 0 0\n");
+    scope.image("x/q", 2);
+    let config = ListConfig {
+        channel_in: Some(Pattern::of_channels("{channel}/{}.tif").unwrap()),
+        channels: Some(vec!["SE".to_owned(), "BSE".to_owned(), "x".to_owned()]),
+        ..roomy(&list)
+    };
+    let mut watch = scope.watch(config);
+    follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+    let missing = watch.missing().unwrap();
+    assert!(missing.contains("2 of the 2 images"), "{missing}");
+    assert!(scope.records().is_empty());
 }
 
 /// Where a list names images as parts of URLs, so it does channels.

@@ -1,12 +1,14 @@
 //! Images that come after the list that names them.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use saccade_archive::acquisition::Record;
 use saccade_ingest::watch::{Disk, ListWatch};
 
 use super::replayed::spec;
-use super::{Scope, roomy, write};
+use super::{SIZE, Scope, roomy, shown, write};
+use crate::scope::{archive, texture};
 
 /// Lists images of sections 0, 1, 2 and so on.
 fn sections(files: &[&str]) -> String {
@@ -77,10 +79,72 @@ fn an_image_where_the_list_has_it_takes_the_place_of_a_stray_one() {
     assert_eq!(told(&scope, &mut watch, 0), []);
     // Also where it comes while nobody looks.
     scope.image("old/q", 3);
-    write(&list, sections(&["s00/r0", "s00/q"]));
+    write(&list, sections(&["s00/r0", "s01/q"]));
     assert_eq!(told(&scope, &mut watch, 1), [picture(1, "old/q")]);
     drop(watch);
-    scope.image("s00/q", 4);
+    scope.image("s01/q", 4);
     let mut watch = scope.watch(roomy(&list));
-    assert_eq!(told(&scope, &mut watch, 1), [picture(1, "s00/q")]);
+    assert_eq!(told(&scope, &mut watch, 1), [picture(1, "s01/q")]);
+}
+
+/// Where the folder that the list names is there, or others of the list in it, an image that is elsewhere is another.
+#[test]
+fn an_image_whose_folder_is_there_is_late_and_nowhere_else() {
+    for below in ["", "pictures/"] {
+        let scope = Scope::new();
+        let list = scope.file("list.txt");
+        let line = |file: &str, z: u32| format!("{below}{file}.tif 0 0 {z}\n");
+        scope.image("s00/r0", 1);
+        scope.image("s01/r1", 2);
+        write(&list, line("s00/r0", 0) + &line("s00/r1", 1));
+        let mut watch = scope.watch(roomy(&list));
+        assert_eq!(
+            told(&scope, &mut watch, 1),
+            [picture(0, "s00/r0")],
+            "{below}"
+        );
+        assert_eq!(told(&scope, &mut watch, 0), [], "{below}");
+        let missing = watch.missing().unwrap();
+        assert!(missing.contains("s00/r1"), "{missing}");
+        scope.image("s00/r1", 3);
+        assert_eq!(
+            told(&scope, &mut watch, 1),
+            [picture(1, "s00/r1")],
+            "{below}"
+        );
+    }
+}
+
+/// A list that grows may name last what was taken for another image.
+#[tokio::test]
+async fn what_turns_out_to_be_anothers_is_given_back() {
+    let scope = Scope::new();
+    let list = scope.file("specs.json");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let by_section = async || {
+        let tiles = shown(&archive).await.into_values();
+        tiles
+            .map(|(section, _, pixels)| (section, pixels))
+            .collect::<BTreeMap<_, _>>()
+    };
+    let pixels = |seed: u8| texture(SIZE, seed);
+    scope.image("s01/r0", 1);
+    write(&list, sections(&["s00/r0"]));
+    drop(scope.once(roomy(&list), &archive).await);
+    assert_eq!(by_section().await, BTreeMap::from([(0, pixels(1))]));
+
+    write(&list, sections(&["s00/r0", "s01/r0"]));
+    let watch = scope.once(roomy(&list), &archive).await;
+    assert_eq!(by_section().await, BTreeMap::from([(1, pixels(1))]));
+    assert!(watch.missing().unwrap().contains("s00/r0"));
+    drop(watch);
+    let records = scope.records().len();
+    drop(scope.once(roomy(&list), &archive).await);
+    assert_eq!(scope.records().len(), records, "it is given back once");
+
+    scope.image("s00/r0", 2);
+    let watch = scope.once(roomy(&list), &archive).await;
+    assert_eq!(watch.missing(), None);
+    let both = BTreeMap::from([(0, pixels(2)), (1, pixels(1))]);
+    assert_eq!(by_section().await, both);
 }
