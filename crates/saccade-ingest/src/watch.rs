@@ -467,6 +467,9 @@ impl<F: Folders> Watch<F> {
                     UVec2::ONE
                 }
             };
+            if size == UVec2::ONE {
+                self.scanner.expects_more_of(&unread.found);
+            }
             let record = Record::Tile(self.record(&unread.found, size));
             let stamp = stamp.map(|stamp| self.scanner.tells(&unread.found.file, stamp));
             self.untold.push_back((record, stamp));

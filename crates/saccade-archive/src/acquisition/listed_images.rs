@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use super::AcquisitionError;
 use super::image_path;
@@ -59,11 +59,15 @@ pub fn key(name: &str) -> u64 {
     BuildHasherDefault::<DefaultHasher>::default().hash_one(name)
 }
 
-/// A path's last part and so many folders before it, however they are separated; `None` if there are not so many.
-fn tail(file: &str, folders: usize) -> Option<String> {
+/// A path's parts from its end on, however they are separated, without those that mean nothing.
+fn parts(file: &str) -> impl Iterator<Item = &str> {
     let parts = file.rsplit(['/', '\\']);
-    let parts = parts.filter(|part| !matches!(*part, "" | "."));
-    let mut parts: Vec<_> = parts.take(folders + 1).collect();
+    parts.filter(|part| !matches!(*part, "" | "."))
+}
+
+/// A path's last part and so many folders before it; `None` if there are not so many.
+fn tail(file: &str, folders: usize) -> Option<String> {
+    let mut parts: Vec<_> = parts(file).take(folders + 1).collect();
     parts.reverse();
     (parts.len() > folders).then(|| parts.join("/"))
 }
@@ -95,19 +99,24 @@ fn from_its_end(path: &str) -> String {
 
 /// The folder that a list names for an image, in one spelling; `None` if it names none.
 fn folder_of(file: &str) -> Option<String> {
-    let parts = file.split(['/', '\\']);
-    let parts: Vec<_> = parts.filter(|part| !matches!(*part, "" | ".")).collect();
-    let (_, folders) = parts.split_last()?;
+    let mut folders: Vec<_> = parts(file).skip(1).collect();
+    folders.reverse();
     (!folders.is_empty()).then(|| folders.join("/"))
 }
 
 /// How many folders two paths have in common from their ends on.
 fn likeness(path: &Path, file: &str) -> usize {
     let folders = path.components().rev().skip(1);
-    let named = file.rsplit(['/', '\\']).skip(1);
-    let both = folders.zip(named);
+    let both = folders.zip(parts(file).skip(1));
     both.take_while(|(folder, named)| folder.as_os_str() == *named)
         .count()
+}
+
+/// The path below the root that a list names, in one spelling; `None` if it leads out.
+fn path_of(file: &str) -> Option<PathBuf> {
+    let path = image_path(Path::new(""), file)?;
+    let parts = { path.components() }.filter(|part| !matches!(part, Component::CurDir));
+    Some(parts.collect())
 }
 
 fn is_named(path: &Path, file: &str) -> bool {
@@ -249,7 +258,7 @@ impl<F: Files> Seeker<'_, F> {
             return 0;
         };
         let count = folder.split('/').count().min(MOST_FOLDERS);
-        let named = image_path(Path::new(""), file);
+        let named = path_of(file);
         let named = named.as_deref().and_then(Path::parent);
         let named = named.filter(|named| !named.as_os_str().is_empty());
         if named.is_some_and(|named| self.files.is_folder(named)) {
@@ -273,16 +282,13 @@ impl<F: Files> Seeker<'_, F> {
 
     /// The image at the path that a list calls `file`.
     fn exactly(&self, file: &str) -> Option<PathBuf> {
-        let named = image_path(Path::new(""), file)?;
-        let is_there = self.files.is_there(&named);
-        is_there.then(|| named.components().collect())
+        path_of(file).filter(|named| self.files.is_there(named))
     }
 
     /// Whether an image can be what a list calls `file`, as far as that can be told without looking at any file.
     pub fn may_be(&self, path: &Path, file: &str) -> bool {
         let may_be = |file: &str| {
-            let named = image_path(Path::new(""), file);
-            let is_exact = named.is_some_and(|named| named.components().eq(path.components()));
+            let is_exact = path_of(file).is_some_and(|named| named == path);
             let can_be = || self.mentions.may_be(path, file) && self.files.can_be(path, file);
             is_named(path, file) && (is_exact || can_be())
         };
@@ -469,8 +475,13 @@ mod tests {
             fs::write(path, "").unwrap();
         }
         let images = Images::below(folder.path()).unwrap();
-        for before in ["", "/scope/", "C:\\scope\\", "./"] {
-            let listed = [0, 1, 2, 3].map(|z| format!("{before}s{z:02}/raw/r.tif"));
+        for (before, slash) in [
+            ("", "/"),
+            ("/scope/", "//"),
+            ("C:\\scope\\", "\\"),
+            ("./", "/./"),
+        ] {
+            let listed = [0, 1, 2, 3].map(|z| format!("{before}s{z:02}{slash}raw{slash}r.tif"));
             let files = listed.iter().map(String::as_str).chain(["x/one.tif"]);
             let found = images.of_list(files.clone());
             let below = |path: &PathBuf| path.strip_prefix(folder.path()).unwrap().to_owned();

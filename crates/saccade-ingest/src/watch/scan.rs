@@ -361,6 +361,12 @@ impl<F: Folders> Scanner<F> {
         (key, seen)
     }
 
+    /// Says that a file which is told of is not whole yet: whoever writes it may still go on.
+    pub(super) fn expects_more_of(&mut self, found: &Found) {
+        let (key, now) = (self.hasher.hash_one(&*found.file), self.folders.now());
+        self.again.add(key, found, now);
+    }
+
     /// Says when earlier processes told of the last file.
     pub fn told_until(&mut self, at: SystemTime) {
         self.told_until = at;

@@ -307,7 +307,7 @@ async fn a_file_that_comes_late_is_taken_in() {
     let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
     let archive = archive(folder.path()).await;
     scope.say(&tile_record("late", 0, SIZE));
-    let options = saccade_ingest::ingest::IngestOptions {
+    let options = IngestOptions {
         once: false,
         ..quick()
     };
@@ -333,7 +333,7 @@ async fn a_file_that_comes_late_is_taken_in() {
         cancel.cancel();
     };
     let both = async { tokio::join!(ingest, other) };
-    let both = tokio::time::timeout(std::time::Duration::from_secs(60), both).await;
+    let both = tokio::time::timeout(Duration::from_secs(60), both).await;
     let summary = both.expect("it is taken in").0.unwrap();
     assert_eq!((summary.tiles, summary.quarantined), (1, 0));
     assert_eq!(
@@ -352,7 +352,7 @@ async fn a_file_that_comes_between_two_runs_is_taken_in_by_the_next() {
     }
     scope.tile("there", 0, SIZE, 3);
     let again = async |once: bool, tiles: u64| {
-        let options = saccade_ingest::ingest::IngestOptions { once, ..quick() };
+        let options = IngestOptions { once, ..quick() };
         let cancel = Cancel::new();
         let ingest = run(scope.path(), &archive, &options, &(), &cancel);
         let ends = async {
@@ -364,7 +364,7 @@ async fn a_file_that_comes_between_two_runs_is_taken_in_by_the_next() {
             }
         };
         let both = async { tokio::join!(ingest, ends) };
-        let both = tokio::time::timeout(std::time::Duration::from_secs(60), both).await;
+        let both = tokio::time::timeout(Duration::from_secs(60), both).await;
         both.expect("it is taken in").0.unwrap();
         let set_aside = archive.catalog().quarantined(VOLUME).await.unwrap();
         (
@@ -542,7 +542,7 @@ async fn a_tile_that_is_mended_meanwhile_is_not_counted_as_set_aside() {
     scope.say(&Record::Tile(TileRecord { tile, ..bad }));
     scope.tile("a", 0, SIZE, 5);
     let diary = Diary::default();
-    let options = saccade_ingest::ingest::IngestOptions {
+    let options = IngestOptions {
         workers: 1,
         ..quick()
     };

@@ -363,8 +363,9 @@ impl<F: Folders> ListWatch<F> {
 }
 
 impl<F: Folders> ListWatch<F> {
-    /// Takes away the tiles whose own image is not there and which show another's, or one that is surely not theirs: the list
-    /// did not name that one's tile when it was taken, or the folder of their own was not there yet.
+    /// Takes away the tiles whose own image is not there and which show one that may as well be another's, or that is surely not
+    /// theirs: the list did not name the other when it was taken, or their own folder was not there. So what is shown does not
+    /// depend on what came first.
     fn give_back(&mut self) {
         let told = { self.tiles.iter() }.filter_map(|(name, tile)| {
             let wanted = { tile.wanted.as_ref() }.filter(|wanted| wanted.image == Image::Missing);
@@ -372,7 +373,9 @@ impl<F: Folders> ListWatch<F> {
         });
         let wrong = told.filter(|(_, wanted, told)| {
             self.folder.join(told).is_file()
-                && (self.index.is_stray(told, wanted) || self.is_anothers(told, wanted))
+                && (!self.index.may_be(told, wanted)
+                    || self.index.is_stray(told, wanted)
+                    || self.is_anothers(told, wanted))
         });
         let wrong: Vec<Arc<str>> = wrong.map(|(name, ..)| Arc::clone(name)).collect();
         for name in wrong {

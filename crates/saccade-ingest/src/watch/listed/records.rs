@@ -143,7 +143,8 @@ impl<F: Folders> ListWatch<F> {
             let known = self.seen.get(&key(&file)).copied().flatten();
             let growing = known.filter(|_| was_replaced && self.again.holds(key(&file)));
             let seen = stamp.map(|stamp| {
-                if stamp.is_young(now) {
+                // Whoever writes one that is not whole may still go on.
+                if stamp.is_young(now) || size == UVec2::ONE {
                     self.again.add(key(&file), &file, now);
                 }
                 (key(&file), growing.unwrap_or(Seen::of(&stamp)))

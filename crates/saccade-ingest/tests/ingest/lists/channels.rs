@@ -97,12 +97,7 @@ async fn names_say_the_channel_and_the_order_of_the_list_theirs() {
     // A list of which no name fits takes nothing out.
     write(&list, "c.tif 0 0 1\n");
     let mut watch = scope.watch(by_name());
-    let refused = saccade_ingest::watch::follow(
-        &mut watch,
-        saccade_ingest::watch::Until::End,
-        true,
-        &saccade_ingest::Cancel::new(),
-    );
+    let refused = follow(&mut watch, Until::End, true, &Cancel::new());
     let refused = refused.unwrap_err().to_string();
     assert!(
         refused.contains("no image that the list names fits"),

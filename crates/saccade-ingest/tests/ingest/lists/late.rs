@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use saccade_archive::VisualizationArchive;
 use saccade_archive::acquisition::Record;
 use saccade_ingest::watch::{Disk, ListWatch};
 
@@ -147,4 +148,38 @@ async fn what_turns_out_to_be_anothers_is_given_back() {
     assert_eq!(watch.missing(), None);
     let both = BTreeMap::from([(0, pixels(2)), (1, pixels(1))]);
     assert_eq!(by_section().await, both);
+}
+
+/// However the list writes paths, and also where it cannot tell which of two it is.
+#[tokio::test]
+async fn what_is_shown_does_not_depend_on_what_was_listed_first() {
+    let forms = [
+        (["./pictures/s00/r", "./pictures/s01/r"], vec![1]),
+        (["pictures//s00/./r", "pictures//s01/./r"], vec![1]),
+        (["/m//s00//r", "/m//s01//r"], vec![1]),
+        (["/m/s00/raw/r", "/m/s01/raw/r"], vec![]),
+        (["pictures/a/r", "pictures/b/r"], vec![]),
+    ];
+    for ([first, second], sections) in forms {
+        let scope = Scope::new();
+        let list = scope.file("list.txt");
+        scope.image("s01/r", 1);
+        let line = |file: &str, z: u32| format!("{file}.tif 0 0 {z}\n");
+        let grown = archive(&scope.0.path().join("archive")).await;
+        write(&list, line(first, 0));
+        drop(scope.once(roomy(&list), &grown).await);
+        assert_eq!(shown(&grown).await.len(), 1, "{first}");
+        write(&list, line(first, 0) + &line(second, 1));
+        drop(scope.once(roomy(&list), &grown).await);
+        let seen = async |archive: &VisualizationArchive| {
+            let tiles = shown(archive).await.into_values();
+            tiles.map(|(section, ..)| section).collect::<Vec<_>>()
+        };
+        assert_eq!(seen(&grown).await, sections, "{first}");
+
+        std::fs::remove_dir_all(scope.kept()).unwrap();
+        let anew = archive(&scope.0.path().join("anew")).await;
+        drop(scope.once(roomy(&list), &anew).await);
+        assert_eq!(seen(&anew).await, sections, "{first}");
+    }
 }
