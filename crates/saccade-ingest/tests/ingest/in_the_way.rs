@@ -227,37 +227,6 @@ fn links_to_no_image_where_names_say_images_are_told_and_not_waited_for() {
     assert_eq!(beside.told().len(), 2);
 }
 
-/// Nobody waits for an empty file for ever; who wrote it may still go on.
-#[test]
-fn an_image_that_is_filled_after_it_was_told_of_is_told_again() {
-    let beside = Beside::new();
-    beside.folder("s0", "r0_c0.tif", 1);
-    let empty = fs::File::create(beside.at("s0/r0_c1.tif")).unwrap();
-    // Not one that came just now.
-    let long_ago = std::time::SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
-    empty.set_modified(long_ago).unwrap();
-    let cancel = Cancel::new();
-    let _ended = Ended(cancel.clone());
-    let mut watch = beside.watch();
-    std::thread::spawn(move || watch::run(&mut watch, false, &cancel).unwrap());
-    let sizes = || {
-        let lines = RecordReader::new(&beside.kept(), Cursor::default()).read(9999);
-        let of = lines
-            .unwrap()
-            .into_iter()
-            .filter_map(|line| match line.record {
-                Ok(Record::Tile(tile)) if tile.tile == "s0_r0_c1" => Some(tile.size),
-                _ => None,
-            });
-        of.collect::<Vec<_>>()
-    };
-    until("the empty one", || (sizes() == [UVec2::ONE]).then_some(()));
-    fs::write(beside.at("s0/r0_c1.tif"), tiff8(SIZE, &texture(SIZE, 2))).unwrap();
-    until("the image", || {
-        (sizes().last() == Some(&SIZE)).then_some(())
-    });
-}
-
 /// A folder that is called as an image is none, nor is a file that is called as a folder of them.
 #[test]
 fn what_names_say_and_is_of_another_kind_is_missing_to_who_looks_once() {

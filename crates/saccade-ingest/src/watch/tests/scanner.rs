@@ -27,6 +27,8 @@ struct Counted {
     stamps: Arc<Mutex<BTreeMap<PathBuf, u64>>>,
     asked: Rc<Cell<usize>>,
     entries: Arc<std::sync::atomic::AtomicUsize>,
+    /// Seconds that have passed.
+    passed: Rc<Cell<u64>>,
 }
 
 impl Counted {
@@ -85,8 +87,44 @@ impl Folders for Counted {
     }
 
     fn now(&self) -> SystemTime {
-        Self::at(1_000_000)
+        Self::at(1_000_000 + self.passed.get())
     }
+}
+
+/// One that is not whole is told of after a while; whoever writes it may still go on, and its folder does not change.
+#[test]
+fn a_file_of_which_more_is_expected_is_looked_at_again() {
+    let disk = Counted::default();
+    disk.add("", "s1.tif", false, 1);
+    let pattern = "s{section}.tif".parse().unwrap();
+    let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern);
+    let mut after = |seconds: u64, scanner: &mut Scanner<Counted>| {
+        let mut all = Vec::new();
+        for _ in 0..seconds {
+            disk.passed.set(disk.passed.get() + 1);
+            all.extend(scanner.look(9).unwrap().0);
+        }
+        all
+    };
+    let [found] = after(4, &mut scanner).try_into().unwrap();
+    scanner.tells(&found.file, stamp(1));
+    let fill = |at: u64| {
+        let path = PathBuf::from("/r/s1.tif");
+        disk.stamps.lock().unwrap().insert(path, at);
+    };
+    fill(2);
+    assert!(
+        after(9, &mut scanner).is_empty(),
+        "nobody looks at what is told of"
+    );
+    scanner.expects_more_of(&found);
+    assert_eq!(after(9, &mut scanner).len(), 1);
+    fill(3);
+    assert_eq!(after(9, &mut scanner).len(), 1);
+    // Not for ever.
+    after(60, &mut scanner);
+    fill(4);
+    assert!(after(9, &mut scanner).is_empty());
 }
 
 /// Sections of many tiles that were there for ever, listed out of thin air; of the first, one more file from a
