@@ -98,7 +98,7 @@ fn a_file_of_which_more_is_expected_is_looked_at_again() {
     disk.add("", "s1.tif", false, 1);
     let pattern = "s{section}.tif".parse().unwrap();
     let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern);
-    let mut after = |seconds: u64, scanner: &mut Scanner<Counted>| {
+    let after = |seconds: u64, scanner: &mut Scanner<Counted>| {
         let mut all = Vec::new();
         for _ in 0..seconds {
             disk.passed.set(disk.passed.get() + 1);
