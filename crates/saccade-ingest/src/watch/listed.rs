@@ -282,7 +282,9 @@ impl<F: Folders> ListWatch<F> {
             let there = names(file).find_map(|name| odd.get(&*name).copied());
             let Some(path) = there.or_else(|| self.index.folder(file)) else {
                 if examples.len() < SHOWN {
-                    examples.push(format!("{file:?}"));
+                    let not_taken = self.index.not_taken(file);
+                    let why = not_taken.map_or_else(String::new, |why| format!(" ({why})"));
+                    examples.push(format!("{file:?}{why}"));
                 }
                 if absent < MOST_ASKED && blocked.is_none() {
                     blocked = self.index.blocked(file).map(|why| (file, why));
@@ -314,7 +316,7 @@ impl<F: Folders> ListWatch<F> {
                 None => examples.join(", "),
             };
             said.push(format!(
-                "{absent} of the {all} images that the list names are not below {}, such as {such_as}",
+                "{absent} of the {all} images that the list names are not found below {}, such as {such_as}",
                 self.folder.display()
             ));
         }

@@ -466,7 +466,7 @@ impl Ingest {
         say(&format!("{done}: {location}"));
         if let Some(missing) = &missing {
             say(&format!(
-                "{missing}; they are taken in when it is started again"
+                "{missing}; those that are there by then are taken in when it is started again"
             ));
         }
         let all = !self.once || (set_aside == 0 && missing.is_none());

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use saccade_archive::acquisition::image_path;
-use saccade_archive::acquisition::listed_images::{Ends, Files, Mentions, Seeker};
+use saccade_archive::acquisition::listed_images::{Ends, Files, Mentions, NotTaken, Seeker};
 pub(super) use saccade_archive::acquisition::listed_images::{Sought, key, names};
 pub(super) use saccade_archive::acquisition::tile_list::base;
 use saccade_archive::acquisition::tile_list::decoded;
@@ -222,6 +222,18 @@ impl Index {
         blocked(file).or_else(|| blocked(&decoded(file)?))
     }
 
+    /// Of what is missing: which image is called so and is not taken for it, and why, in words.
+    pub(super) fn not_taken(&self, file: &str) -> Option<String> {
+        let (path, why) = self.seeker().not_taken(file)?;
+        Some(match why {
+            NotTaken::AsAnother => format!(
+                "{path:?} fits other images of the list as well; name it with its folders there"
+            ),
+            NotTaken::Elsewhere => format!("{path:?} is not in the folder that the list names"),
+            NotTaken::Channel => format!("{path:?} is of another channel, as paths say"),
+        })
+    }
+
     /// Looks again at some of what is nothing to read: links may lead to something later.
     fn look_at_odd(&mut self) {
         const AT_ONCE: usize = 64;
@@ -393,8 +405,20 @@ impl Files for Index {
 mod tests {
     use std::fs;
 
+    use saccade_archive::acquisition::listed_images;
+
     use super::super::super::Disk;
     use super::*;
+
+    #[test]
+    fn is_files() {
+        let root = tempfile::tempdir().unwrap();
+        listed_images::conformance::check(root.path(), |root| {
+            let mut index = Index::new(root);
+            while index.look(&Disk, 2).unwrap().1 == Next::More {}
+            index
+        });
+    }
 
     #[test]
     fn files_are_found_at_their_path_or_by_name_wherever_they_are() {

@@ -45,7 +45,7 @@ async fn what_is_no_file_is_missing() {
         r#""pictures/b.tif" is a link to nothing"#,
         r#""pictures/c.tif" is no regular file"#,
         r#""pictures/d.tif" is no regular file"#,
-        "1 of the 6 images that the list names are not below",
+        "1 of the 6 images that the list names are not found below",
         r#"such as "far/e.tif""#,
     ];
     for said in said {
@@ -62,6 +62,32 @@ async fn what_is_no_file_is_missing() {
     let missing = watch.missing().unwrap();
     assert!(missing.contains("2 of the 6 images"), "{missing}");
     assert!(!missing.contains("b.tif"), "{missing}");
+}
+
+/// Who sees an image of that name in the folder is told why it does not count.
+#[tokio::test]
+async fn what_is_not_taken_is_named_with_the_reason() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    scope.image("r", 1);
+    write(&list, "s0/r.tif 0 0 0\ns1/r.tif 0 0 1\nnone.tif 0 0 0\n");
+    let watch = scope.once(roomy(&list), &archive).await;
+    let missing = watch.missing().unwrap();
+    let reason = r#"("pictures/r.tif" fits other images of the list as well; name it with its folders there)"#;
+    assert!(
+        missing.contains(&format!(r#""s0/r.tif" {reason}"#)),
+        "{missing}"
+    );
+    assert!(
+        missing.contains(&format!(r#""s1/r.tif" {reason}"#)),
+        "{missing}"
+    );
+    assert!(
+        missing.ends_with(r#", "none.tif""#) || missing.contains(r#""none.tif", "#),
+        "{missing}"
+    );
+    assert!(seen(&archive).await.is_empty());
 }
 
 /// A slip in a number binds nobody.
