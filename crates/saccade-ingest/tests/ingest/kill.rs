@@ -3,7 +3,7 @@
 //! The tests run themselves as child processes that follow an acquisition archive and never end on
 //! their own. Each time one is killed while records are still to do, the catalog is looked at. In the
 //! end, what came about in pieces is compared with an undisturbed run. How often is said by
-//! `SACCADE_TEST_KILLS`, see the README of these tests.
+//! `SACCADE_TEST_KILLS`, when by `SACCADE_TEST_SEED`; `./dev kills` says both.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -39,6 +39,13 @@ fn kills() -> u32 {
     said.map_or(20, |n| n.parse().expect("SACCADE_TEST_KILLS is a number"))
 }
 
+/// The seed of a test, another one with each `SACCADE_TEST_SEED`.
+fn drawn(seed: u64) -> u64 {
+    let said = std::env::var("SACCADE_TEST_SEED").ok();
+    let said = said.map_or(0, |n| n.parse().expect("SACCADE_TEST_SEED is a number"));
+    seed ^ u64::wrapping_mul(said, 0x9e37_79b9_7f4a_7c15)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_killed_ingest_loses_nothing_and_names_only_whole_pyramids() {
     const NAME: &str = "kill::a_killed_ingest_loses_nothing_and_names_only_whole_pyramids";
@@ -48,7 +55,7 @@ async fn a_killed_ingest_loses_nothing_and_names_only_whole_pyramids() {
     let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
     let place = Place::new(&scope, folder.path(), None);
     let late = prepare(&scope);
-    let mut random = Random(0x5acc_ade5);
+    let mut random = Random(drawn(0x5acc_ade5));
     let (mut said, mut done) = (0, 0);
     let (mut moved_on, mut in_the_middle) = (0, 0);
     let kills = kills();
@@ -110,7 +117,7 @@ async fn workers_and_server_can_be_killed() {
     let url = server.database().await;
     let place = Place::new(&scope, folder.path(), Some(url));
     let late = prepare(&scope);
-    let mut random = Random(0xface_5acc);
+    let mut random = Random(drawn(0xface_5acc));
     let kills = kills();
     let (mut said, mut done, mut in_the_middle, mut of_server) = (0, 0, 0, 0);
     let mut acknowledged = BTreeSet::new();

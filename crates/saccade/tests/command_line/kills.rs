@@ -1,6 +1,6 @@
 //! `kill -9` at random moments of those who write what ingest takes in, and of those who show what it made.
 //!
-//! How often is said by `SACCADE_TEST_KILLS`. Each time the program is started again as if nothing had happened; what it
+//! How often is said by `SACCADE_TEST_KILLS`, when by `SACCADE_TEST_SEED`. Each time the program is started again as if nothing had happened; what it
 //! has made in the end is what one that nobody disturbed makes. Ingest itself is killed by the tests of its crate.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -15,9 +15,16 @@ use saccade_archive::acquisition::{Cursor, Record, RecordReader};
 use super::errors::text;
 use super::{Running, done, saccade};
 
-fn kills() -> u32 {
+pub(super) fn kills() -> u32 {
     let said = std::env::var("SACCADE_TEST_KILLS").ok();
     said.map_or(6, |n| n.parse().expect("SACCADE_TEST_KILLS is a number"))
+}
+
+/// The seed of a test, another one with each `SACCADE_TEST_SEED`.
+fn drawn(seed: u64) -> u64 {
+    let said = std::env::var("SACCADE_TEST_SEED").ok();
+    let said = said.map_or(0, |n| n.parse().expect("SACCADE_TEST_SEED is a number"));
+    seed ^ u64::wrapping_mul(said, 0x9e37_79b9_7f4a_7c15)
 }
 
 /// A small generator, so that a failing run can be repeated.
@@ -34,23 +41,23 @@ impl Random {
 }
 
 /// Runs a program that ends on its own, and kills it before that. It adapts to the machine: kills come while it works.
-struct Killer {
+pub(super) struct Killer {
     random: Random,
     longest: Duration,
-    kills: u32,
+    pub(super) kills: u32,
 }
 
 impl Killer {
-    fn new(seed: u64) -> Self {
+    pub(super) fn new(seed: u64) -> Self {
         Self {
-            random: Random(seed),
+            random: Random(drawn(seed)),
             longest: Duration::from_millis(400),
             kills: 0,
         }
     }
 
     /// One life; whether it was killed, rather than done before.
-    fn life(&mut self, arguments: &[&str]) -> bool {
+    pub(super) fn life(&mut self, arguments: &[&str]) -> bool {
         let mut command = saccade();
         command.args(arguments).stderr(Stdio::null());
         let mut life = Running(command.spawn().unwrap());
@@ -69,7 +76,7 @@ impl Killer {
 }
 
 /// Files below a folder, and what is in them.
-fn tree(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+pub(super) fn tree(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let (mut files, mut open) = (BTreeMap::new(), vec![folder.to_owned()]);
     while let Some(at) = open.pop() {
         let Ok(entries) = fs::read_dir(&at) else {
@@ -265,7 +272,7 @@ fn a_killed_server_shows_nothing_half_written() {
     };
     let there = want.values().filter(|(status, _)| *status == 200).count();
     assert!(there > 10, "{there} chunks with voxels");
-    let mut random = Random(0x5acc_0003);
+    let mut random = Random(drawn(0x5acc_0003));
     let (whole, broken) = (AtomicUsize::new(0), AtomicUsize::new(0));
     for _ in 0..kills() {
         let (mut running, url) = start(true);

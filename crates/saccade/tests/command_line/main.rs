@@ -10,8 +10,11 @@ mod errors;
 mod export_power_cuts;
 mod failed_sync;
 mod failing_volume;
+#[cfg(target_os = "linux")]
+mod full_disk;
 mod images;
 mod kills;
+mod kills_of_changes;
 mod labels;
 mod list_channels;
 mod lists;

@@ -1,0 +1,121 @@
+//! A disk that is really full: a small one in memory, in a name space of its own, where the system allows that;
+//! `SACCADE_FULL_DISK_TESTS=require` makes it a failure if it does not.
+
+use std::fs;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use super::errors::text;
+use super::kills::{image, tree};
+use super::{Running, done, simulate};
+
+/// Everything that ingest writes finds no room: pyramids and the catalog. `$1` is the program, `$2` the acquisition, `$3` the disk,
+/// `$4` what becomes of it while the disk is full, `wait` or `KILL`, `$5` a folder for what is said and for the archive that is made.
+const SCRIPT: &str = r#"
+set -e
+mount -t tmpfs -o size=16m saccade-test "$3"
+head -c 15m /dev/zero > "$3/ballast"
+"$1" ingest "$2" "$3/archive" --once --lossless 2> "$5/log" &
+ingest=$!
+tries=0
+until grep -q 'waits: no space is left to write; free some' "$5/log"; do
+  tries=$((tries + 1))
+  test $tries -lt 600
+  sleep 0.1
+done
+# It goes on waiting.
+sleep 1
+kill -0 $ingest
+if [ "$4" = KILL ]; then
+  kill -KILL $ingest
+  wait $ingest || true
+  rm "$3/ballast"
+  "$1" ingest "$2" "$3/archive" --once --lossless 2> "$5/again"
+else
+  rm "$3/ballast"
+  wait $ingest
+fi
+"$1" check "$3/archive" --acquisition "$2" > "$5/check" 2>&1
+cp -r "$3/archive" "$5/archive"
+"#;
+
+/// Whether this system lets anybody mount a disk of their own.
+fn can_mount() -> bool {
+    let tried = Command::new("unshare")
+        .args(["--user", "--map-root-user", "--mount", "sh", "-c"])
+        .arg("mount -t tmpfs saccade-test /mnt")
+        .stderr(Stdio::null())
+        .status();
+    tried.is_ok_and(|status| status.success())
+}
+
+fn fill_and_go_on(end: &str) {
+    if !can_mount() {
+        assert!(
+            std::env::var_os("SACCADE_FULL_DISK_TESTS").is_none_or(|said| said != "require"),
+            "SACCADE_FULL_DISK_TESTS=require, but no disk can be mounted with `unshare`"
+        );
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    for name in ["disk", "out"] {
+        fs::create_dir(at(name)).unwrap();
+    }
+    simulate(&at("acquisition"), "300,260,16");
+    let program = env!("CARGO_BIN_EXE_saccade");
+    let mut command = Command::new("unshare");
+    command
+        .args([
+            "--user",
+            "--map-root-user",
+            "--mount",
+            "--fork",
+            "--kill-child",
+            "sh",
+            "-c",
+            SCRIPT,
+            "sh",
+        ])
+        .arg(program)
+        .args([at("acquisition"), at("disk")])
+        .arg(end)
+        .arg(at("out"))
+        .stdin(Stdio::null());
+    let mut running = Running(command.spawn().unwrap());
+    let mut looks = (0..3600).map(|_| {
+        std::thread::sleep(Duration::from_millis(50));
+        running.0.try_wait().unwrap()
+    });
+    let status = looks.find_map(|status| status).expect("it hangs");
+    let said = |name: &str| fs::read_to_string(at("out").join(name)).unwrap_or_default();
+    let (log, check) = (said("log"), said("check"));
+    assert!(status.success(), "{log}\n{}\n{check}", said("again"));
+    assert!(log.contains("No space left on device"), "{log}");
+    // What a machine with room makes.
+    let [roomy, acquisition] = ["roomy", "acquisition"].map(at);
+    done([
+        "ingest",
+        text(&acquisition),
+        text(&roomy),
+        "--once",
+        "--lossless",
+    ]);
+    let [want, got] = [roomy, at("out").join("archive")].map(|archive| {
+        let exported = archive.with_extension("zarr");
+        done(["export", text(&archive), text(&exported)]);
+        image(tree(&exported))
+    });
+    assert!(want.len() > 5, "{:?}", want.keys());
+    assert!(got == want, "other voxels");
+}
+
+#[test]
+fn work_goes_on_when_there_is_room_again() {
+    fill_and_go_on("wait");
+}
+
+#[test]
+fn who_is_killed_while_the_disk_is_full_loses_nothing() {
+    fill_and_go_on("KILL");
+}
