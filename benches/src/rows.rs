@@ -1,6 +1,7 @@
 //! The rows, in groups that are measured together.
 
 mod attackers;
+mod blocks;
 mod codec;
 mod construct;
 mod first_light;
@@ -44,8 +45,16 @@ pub(crate) static GROUPS: &[Group] = &[
         measure: |_| update::measure(),
     },
     Group {
+        ids: update::REMOTE_IDS,
+        measure: |_| update::measure_remote(),
+    },
+    Group {
         ids: ingest::IDS,
         measure: |_| ingest::measure(),
+    },
+    Group {
+        ids: ingest::SUSTAINED_IDS,
+        measure: |_| ingest::measure_sustained(),
     },
     Group {
         ids: ingest::MEMORY_IDS,
@@ -70,6 +79,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: construct::IDS,
         measure: |_| construct::measure(),
+    },
+    Group {
+        ids: blocks::IDS,
+        measure: |_| blocks::measure(),
     },
     Group {
         ids: section::IDS,

@@ -1,8 +1,10 @@
 //! The arithmetic of stitching alone, beside OpenCV's.
 //!
-//! The same work: an image of noise, an affine map, bilinear interpolation, 8 bit, one thread. Both
-//! are timed by their own processor time, turn by turn.
+//! The same work: one image, an affine map, bilinear interpolation, 8 bit, one thread. Both are timed by their own processor
+//! time, turn by turn, and both pictures compared with what exact arithmetic makes of the map.
 
+use std::fs;
+use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
@@ -22,7 +24,7 @@ pub(crate) const IDS: &[&str] = &[
     "resample.translation.mpix_per_core_s",
 ];
 
-/// Prints seconds of processor time per picture, by degrees.
+/// Prints seconds of processor time per picture, and how far pictures are from the exact one, by degrees.
 const SCRIPT: &str = include_str!("warp_affine.py");
 /// Edge of the image and of what is drawn of it \[pixels\].
 const IMAGE: u32 = 2048;
@@ -34,18 +36,35 @@ const DEGREES: [f64; 6] = [2.0, 0.0, 0.5, 5.0, 15.0, 30.0];
 pub(crate) fn measure() -> Result<Vec<Row>> {
     let image = tissue(IMAGE, 0)?;
     let patch = Patch::of_image(&image, UVec2::splat(IMAGE));
+    let folder = tempfile::tempdir()?;
+    fs::write(folder.path().join("image"), &image)?;
+    for (n, degrees) in DEGREES.iter().enumerate() {
+        let mut picture = vec![0; (PICTURE * PICTURE) as usize];
+        draw_once(&patch, *degrees, &mut picture);
+        fs::write(folder.path().join(n.to_string()), &picture)?;
+    }
+    let (mut off, mut their_off) = (Vec::new(), Vec::new());
     let mut ratios = vec![Vec::new(); DEGREES.len()];
     let mut ours = vec![Vec::new(); DEGREES.len()];
     let mut version = String::new();
     for _ in 0..RUNS {
-        let peer = warp_affine()?;
+        let peer = warp_affine(folder.path())?;
         for (n, (degrees, theirs)) in DEGREES.iter().zip(&peer.seconds).enumerate() {
             let seconds = draw(&patch, *degrees)?;
             ratios[n].push(theirs / seconds);
             ours[n].push(f64::from(PICTURE).powi(2) / 1e6 / seconds);
         }
-        version = peer.version;
+        (version, off, their_off) = (peer.version, peer.off, peer.their_off);
     }
+    let farthest = off.iter().copied().fold(0.0, f64::max);
+    ensure!(farthest <= 1.0, "a pixel is {farthest} grey levels off");
+    let by_angle = |values: &[f64]| {
+        let each = DEGREES
+            .iter()
+            .zip(values)
+            .map(|(degrees, off)| format!("{degrees} degrees: {off:.2}"));
+        each.collect::<Vec<_>>().join(", ")
+    };
     let all = |values: &[Vec<f64>]| {
         let each = DEGREES.iter().zip(values).map(|(degrees, runs)| {
             let row = Row::new("", "", runs.clone());
@@ -71,6 +90,8 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
                 format!("{PICTURE}x{PICTURE} of {IMAGE}x{IMAGE}, tissue with noise, bilinear"),
             )
             .setting("peer", format!("OpenCV {version}, warpAffine, one thread"))
+            .setting("grey levels off the exact picture, at most", by_angle(&off))
+            .setting("the peer's", by_angle(&their_off))
     });
     Ok(described.collect())
 }
@@ -87,21 +108,25 @@ fn first_and_steps(degrees: f64) -> (DVec2, DVec2, DVec2) {
     )
 }
 
+fn draw_once(patch: &Patch, degrees: f64, picture: &mut [u8]) {
+    let (first, along, down) = first_and_steps(degrees);
+    for (y, row) in (0..).zip(picture.chunks_exact_mut(PICTURE as usize)) {
+        patch.sample(
+            Interpolation::Linear,
+            first + down * f64::from(y) + 0.5,
+            along,
+            row,
+        );
+    }
+}
+
 /// Seconds of processor time per picture.
 fn draw(patch: &Patch, degrees: f64) -> Result<f64> {
-    let (first, along, down) = first_and_steps(degrees);
     let mut picture = vec![0; (PICTURE * PICTURE) as usize];
     let start = cpu::time()?;
     let mut pictures = 0;
     loop {
-        for (y, row) in (0..).zip(picture.chunks_exact_mut(PICTURE as usize)) {
-            patch.sample(
-                Interpolation::Linear,
-                first + down * f64::from(y) + 0.5,
-                along,
-                row,
-            );
-        }
+        draw_once(patch, degrees, &mut picture);
         pictures += 1;
         let took = cpu::time()? - start;
         if took >= Duration::from_millis(300) {
@@ -114,9 +139,13 @@ fn draw(patch: &Patch, degrees: f64) -> Result<f64> {
 struct Peer {
     version: String,
     seconds: Vec<f64>,
+    /// Farthest any pixel of our picture is from the exact one \[grey levels\].
+    off: Vec<f64>,
+    their_off: Vec<f64>,
 }
 
-fn warp_affine() -> Result<Peer> {
+/// Lets OpenCV draw the `image` of a folder, and compares with our pictures, which are called by their number.
+fn warp_affine(folder: &Path) -> Result<Peer> {
     let python = std::env::var("SACCADE_BENCH_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let degrees = DEGREES.map(|degrees| {
         let (first, along, down) = first_and_steps(degrees);
@@ -127,6 +156,7 @@ fn warp_affine() -> Result<Peer> {
     });
     let ran = Command::new(&python)
         .args(["-c", SCRIPT, &IMAGE.to_string(), &PICTURE.to_string()])
+        .arg(folder)
         .args(degrees)
         .output()
         .with_context(|| format!("cannot run {python}; `./dev bench` sets it up"))?;
@@ -139,7 +169,7 @@ fn warp_affine() -> Result<Peer> {
     let peer: Peer =
         serde_json::from_slice(&ran.stdout).context("OpenCV's script said nonsense")?;
     ensure!(
-        peer.seconds.len() == DEGREES.len(),
+        [&peer.seconds, &peer.off, &peer.their_off].map(Vec::len) == [DEGREES.len(); 3],
         "OpenCV's script left maps out"
     );
     Ok(peer)

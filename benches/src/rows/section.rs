@@ -15,16 +15,25 @@ use crate::scene::{Mosaic, NAME, Random, drop_from_cache};
 pub(crate) const IDS: &[&str] = &[
     "section.cold_512_worst_ms",
     "section.cold_512_mean_ms",
+    "section.cold_512_least_ms",
     "section.cold_512_worst_ms.level_1",
     "section.cold_512_mean_ms.level_1",
+    "section.cold_512_least_ms.level_1",
     "section.cold_512_worst_ms.level_2",
     "section.cold_512_mean_ms.level_2",
+    "section.cold_512_least_ms.level_2",
     "section.cold_512_worst_ms.level_3",
     "section.cold_512_mean_ms.level_3",
+    "section.cold_512_least_ms.level_3",
 ];
 
-/// Greatest and mean time of table 3, interleaved, by level \[ms\].
-const PUBLISHED: [[f64; 2]; 4] = [[54.01, 9.42], [40.01, 8.88], [25.73, 6.83], [9.72, 4.58]];
+/// Greatest, mean and least time of table 3, interleaved, by level \[ms\].
+const PUBLISHED: [[f64; 3]; 4] = [
+    [54.01, 9.42, 4.41],
+    [40.01, 8.88, 4.57],
+    [25.73, 6.83, 5.13],
+    [9.72, 4.58, 4.58],
+];
 
 const MOSAIC: Mosaic = Mosaic {
     edge: 6000,
@@ -41,7 +50,7 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
     let acquisition = folder.path().join("acquisition");
     MOSAIC.acquire(&acquisition)?;
     let archive_folder = folder.path().join("archive");
-    let mut found = [const { [const { Vec::new() }; 2] }; 4];
+    let mut found = [const { [const { Vec::new() }; 3] }; 4];
     runtime()?.block_on(async {
         let archive = VisualizationArchive::create(&archive_folder).await?;
         let options = ingest::IngestOptions {
@@ -78,16 +87,16 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
                 }
                 found[0].push(times.iter().copied().fold(0.0, f64::max));
                 found[1].push(times.iter().sum::<f64>() / f64::from(sections));
+                found[2].push(times.iter().copied().fold(f64::INFINITY, f64::min));
             }
         }
         anyhow::Ok(())
     })?;
-    let what =
-        "Hadwiger et al. 2012, table 3, interleaved: machine of 12 cores, stitching on its GPU";
+    let what = "Hadwiger et al. 2012, table 3, interleaved: machine of 12 cores, stitching on its GPU; the least of files in its memory";
     let published = PUBLISHED.into_iter().flatten();
     let rows = IDS.iter().zip(found.into_iter().flatten()).zip(published);
     let described = (0..).zip(rows).map(|(n, ((id, runs), peer))| {
-        let (level, row) = (n / 2, Row::new(id, "ms", runs).peer(peer, what));
+        let (level, row) = (n / 3, Row::new(id, "ms", runs).peer(peer, what));
         row.setting(
             "sections",
             format!(

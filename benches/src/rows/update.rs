@@ -2,8 +2,10 @@
 //!
 //! A registration, in another process as far as the catalog is concerned, changes transforms; a stitched
 //! source follows, a session shows. The clock starts when the change is committed and stops at the first
-//! picture that it changed, and at the first complete one.
+//! picture that it changed, and at the first complete one. *Remote*: a server in between, as when a browser shows.
 
+use std::future;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,7 +17,9 @@ use saccade_core::camera::Camera;
 use saccade_core::transform::SectionFromTile;
 use saccade_ingest::{Cancel, ingest};
 use saccade_render::{Gpu, View};
+use saccade_serve::{Options, Server, Volumes};
 use saccade_source::VolumeSource;
+use saccade_source::remote::RemoteSource;
 use saccade_source::stitched::{StitchedOptions, StitchedSource};
 use saccade_stream::{Session, SessionOptions};
 
@@ -30,6 +34,13 @@ pub(crate) const IDS: &[&str] = &[
     "update.transform_to_complete_s",
     "update.section_to_screen_s",
     "update.section_to_complete_s",
+];
+
+pub(crate) const REMOTE_IDS: &[&str] = &[
+    "update.remote.transform_to_screen_s",
+    "update.remote.transform_to_complete_s",
+    "update.remote.section_to_screen_s",
+    "update.remote.section_to_complete_s",
 ];
 
 /// Edge of a tile, and from one to the next \[pixels\].
@@ -47,9 +58,21 @@ const RUNS: usize = 5;
 const PATIENCE: Duration = Duration::from_secs(120);
 
 pub(crate) fn measure() -> Result<Vec<Row>> {
+    rows(IDS, false)
+}
+
+pub(crate) fn measure_remote() -> Result<Vec<Row>> {
+    let rows = rows(REMOTE_IDS, true)?.into_iter();
+    let between = "HTTP on loopback: chunks, and server-sent events";
+    Ok(rows
+        .map(|row| row.setting("between source and session", between))
+        .collect())
+}
+
+fn rows(ids: &[&'static str], remote: bool) -> Result<Vec<Row>> {
     let folder = tempfile::tempdir()?;
-    let times = runtime()?.block_on(update(folder.path()))?;
-    let rows = IDS.iter().zip(times);
+    let times = runtime()?.block_on(update(folder.path(), remote))?;
+    let rows = ids.iter().zip(times);
     let rows = rows.map(|(id, times)| {
         Row::new(id, "s", times)
             .setting("section", format!("{} tiles of {EDGE}x{EDGE}, overlapping by a tenth", SIDES.element_product()))
@@ -68,7 +91,7 @@ fn place(x: u32, y: u32) -> DVec2 {
     (UVec2::new(x, y) * PITCH).as_dvec2()
 }
 
-async fn update(folder: &Path) -> Result<[Vec<f64>; 4]> {
+async fn update(folder: &Path, remote: bool) -> Result<[Vec<f64>; 4]> {
     let acquisition = folder.join("acquisition");
     let extent = (SIDES * PITCH).extend(SECTIONS) + UVec3::new(EDGE - PITCH, EDGE - PITCH, 0);
     let mut microscope = Microscope::start(&acquisition, extent)?;
@@ -87,7 +110,10 @@ async fn update(folder: &Path) -> Result<[Vec<f64>; 4]> {
     };
     ingest::run(&acquisition, &archive, &options, &(), &Cancel::new()).await?;
     let source = StitchedSource::open(&archive, NAME, StitchedOptions::default()).await?;
-    let source: Arc<dyn VolumeSource> = Arc::new(source);
+    let source: Arc<dyn VolumeSource> = match remote {
+        true => Arc::new(served(Arc::new(source)).await?),
+        false => Arc::new(source),
+    };
     let view = View::new(Camera::around(source.volume()), SIZE);
     let mut session = Session::new(&Gpu::headless().await?, source, SessionOptions::default())?;
     session.settle(&view, PATIENCE).await?;
@@ -132,4 +158,14 @@ async fn update(folder: &Path) -> Result<[Vec<f64>; 4]> {
         }
     }
     Ok(times)
+}
+
+/// A source, as a server of this process offers it.
+async fn served(source: Arc<StitchedSource>) -> Result<RemoteSource> {
+    let server = Server::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).await?;
+    let base = format!("http://{}", server.address());
+    let volumes = Volumes::new();
+    volumes.publish(source, None);
+    tokio::spawn(server.run(volumes, Options::DEFAULT, future::pending()));
+    Ok(RemoteSource::open(&base, NAME).await?)
 }
