@@ -43,7 +43,7 @@ pub struct Entry {
 ///
 /// Names are relative paths such as `tiles/a.tif`, see [`check_name`]. An object is written whole
 /// or not at all: at any instant, and after a crash at any instant, a name holds what the last
-/// finished [`write_durable`](Self::write_durable) put there, or nothing. Implementations pass
+/// finished write put there, or nothing. Implementations pass
 /// [`conformance`].
 ///
 /// Dropping a future gives up waiting; a write that had begun may still take place, whole.
@@ -72,6 +72,19 @@ pub trait Storage: Send + Sync + fmt::Debug {
         name: &'a str,
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>>;
+
+    /// Writes an object unless there is one of that name, and returns what is there then: these bytes, or another's. Of
+    /// several that do so at once one is kept, and all of them get its bytes. They are there even if the
+    /// machine loses power in the next instant, whoever wrote them.
+    ///
+    /// # Errors
+    ///
+    /// As [`write_durable`](Self::write_durable).
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>>;
 
     /// The objects whose names begin with `prefix`, sorted by name. Unfinished writes are not
     /// listed.
@@ -116,6 +129,11 @@ pub trait Storage: Send + Sync + fmt::Debug {
     ///
     /// [`StorageError::NotFound`] where there is no such object, others as they occur.
     fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>>;
+
+    /// Returns once nothing is left to do for writes that were given up, see above: for who is about to end.
+    fn settled(&self) -> BoxFuture<'_, ()> {
+        std::future::ready(()).boxed()
+    }
 
     /// What beginning another read takes, as bytes that could have been read meanwhile: parts of an
     /// object that lie closer together are better read as one.

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
+use super::object::WHOLE;
 use super::{Storage, StorageError};
 use crate::clock::{Clock as _, SystemClock};
 
@@ -27,6 +28,8 @@ pub async fn check(storage: Arc<dyn Storage>) {
     names_are_listed_as_written(storage).await;
     bad_names_are_refused(storage).await;
     readers_see_whole_objects(storage).await;
+    long_objects_are_whole(storage).await;
+    an_object_is_created_once(storage).await;
     for name in names(storage, "").await {
         storage.delete(&name).await.expect("delete");
     }
@@ -166,6 +169,8 @@ async fn bad_names_are_refused(storage: &dyn Storage) {
             storage.write_durable(name, Bytes::new()).await.err(),
             "write",
         );
+        let created = storage.create_durable(name, Bytes::new()).await;
+        refused(created.err(), "create");
         refused(storage.delete(name).await.err(), "delete");
         refused(storage.size(name).await.err(), "size");
     }
@@ -197,4 +202,147 @@ async fn readers_see_whole_objects(storage: &dyn Storage) {
         }
     };
     futures::join!(writer, reader);
+}
+
+/// So long that object stores take them in parts.
+async fn long_objects_are_whole(storage: &dyn Storage) {
+    // Of a prime length, so that parts of an object differ.
+    let long = |length: usize, first: u8| {
+        let some: Vec<u8> = (0..251).map(|n| n ^ first).collect();
+        let mut bytes = some.repeat(length / some.len() + 1);
+        bytes.truncate(length);
+        Bytes::from(bytes)
+    };
+    let versions = [long(WHOLE + WHOLE / 2 + 3, 0), long(WHOLE + 1, 0xff)];
+    let write = async |version: usize| {
+        let written = storage.write_durable("long/a", versions[version].clone());
+        written.await.expect("write");
+    };
+    for (version, bytes) in versions.iter().enumerate() {
+        write(version).await;
+        let size = storage.size("long/a").await.expect("size");
+        assert_eq!(size, bytes.len() as u64);
+        let read = storage.read("long/a", None).await.expect("read");
+        assert!(read == *bytes, "a long object is not what was written");
+        let middle = WHOLE / 2 - 100..WHOLE / 2 + 100;
+        let range = Some(middle.start as u64..middle.end as u64);
+        let read = storage.read("long/a", range).await.expect("read");
+        assert_eq!(read, bytes[middle], "around its middle");
+    }
+    assert_eq!(names(storage, "long/").await, ["long/a"]);
+    let reader = async {
+        for _ in 0..4 {
+            let seen = storage.read("long/a", None).await.expect("read");
+            let whole = versions.contains(&seen);
+            assert!(whole, "a mixture of {} bytes was read", seen.len());
+        }
+    };
+    futures::join!(write(0), reader);
+    storage.delete("long/a").await.expect("delete");
+    assert_eq!(names(storage, "long/").await, [""; 0]);
+}
+
+async fn an_object_is_created_once(storage: &dyn Storage) {
+    let create = async |name: &str, bytes: &[u8]| {
+        let bytes = Bytes::copy_from_slice(bytes);
+        storage.create_durable(name, bytes).await.expect("create")
+    };
+    assert_eq!(create("made/a", b"first").await, b"first"[..]);
+    assert_eq!(create("made/a", b"second").await, b"first"[..]);
+    assert_eq!(names(storage, "made/").await, ["made/a"]);
+    write(storage, "made/a", b"in its place").await;
+    assert_eq!(create("made/a", b"third").await, b"in its place"[..]);
+    storage.delete("made/a").await.expect("delete");
+    assert_eq!(create("made/a", b"fourth").await, b"fourth"[..]);
+    for round in 0..8 {
+        let name = &format!("made/{round}");
+        let creators = (1..=6_u8).map(|own| create_one(storage, name, own));
+        let seen = futures::future::join_all(creators).await;
+        let there = storage.read(name, None).await.expect("read");
+        let kept = (1..=6).any(|own| there == vec![own; 100 * usize::from(own)]);
+        assert!(kept, "what is kept is nobody's: {there:?}");
+        for seen in seen {
+            assert!(
+                seen == there,
+                "of several that create one object, not all get what is kept"
+            );
+        }
+    }
+}
+
+async fn create_one(storage: &dyn Storage, name: &str, own: u8) -> Bytes {
+    let bytes = vec![own; 100 * usize::from(own)];
+    let created = storage.create_durable(name, bytes.into());
+    created.await.expect("create")
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ops::Range;
+
+    use futures::FutureExt as _;
+    use futures::future::BoxFuture;
+
+    use super::super::{Entry, MemoryStorage};
+    use super::*;
+
+    /// Looks first, and then writes.
+    #[derive(Debug, Default)]
+    struct Careless(MemoryStorage);
+
+    impl Storage for Careless {
+        fn read<'a>(
+            &'a self,
+            name: &'a str,
+            range: Option<Range<u64>>,
+        ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+            self.0.read(name, range)
+        }
+
+        fn write_durable<'a>(
+            &'a self,
+            name: &'a str,
+            bytes: Bytes,
+        ) -> BoxFuture<'a, Result<(), StorageError>> {
+            self.0.write_durable(name, bytes)
+        }
+
+        fn create_durable<'a>(
+            &'a self,
+            name: &'a str,
+            bytes: Bytes,
+        ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+            async move {
+                match self.read(name, None).await {
+                    Err(StorageError::NotFound { .. }) => {}
+                    there => return there,
+                }
+                tokio::task::yield_now().await;
+                self.write_durable(name, bytes.clone()).await?;
+                Ok(bytes)
+            }
+            .boxed()
+        }
+
+        fn entries<'a>(
+            &'a self,
+            prefix: &'a str,
+        ) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+            self.0.entries(prefix)
+        }
+
+        fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
+            self.0.delete(name)
+        }
+
+        fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
+            self.0.size(name)
+        }
+    }
+
+    #[tokio::test]
+    #[should_panic(expected = "not all get what is kept")]
+    async fn the_suite_notices_who_looks_and_then_writes() {
+        check(Arc::new(Careless::default())).await;
+    }
 }

@@ -12,10 +12,12 @@ use bytes::Bytes;
 
 mod folder_id;
 mod regular;
+mod rename_new;
 mod simulated;
 
 pub use folder_id::FolderId;
 pub(crate) use regular::{open_regular, read_regular};
+use rename_new::rename_new;
 pub use simulated::{Crash, SimulatedDisk};
 
 /// A file system, in steps that a power cut can come between. All block.
@@ -36,6 +38,13 @@ pub trait Disk: Send + Sync + fmt::Debug {
     ///
     /// What the system says.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
+
+    /// Gives a file another name, unless something has that name.
+    ///
+    /// # Errors
+    ///
+    /// [`io::ErrorKind::AlreadyExists`] if something has; what the system says.
+    fn rename_new(&self, from: &Path, to: &Path) -> io::Result<()>;
 
     /// Removes a file.
     ///
@@ -204,6 +213,10 @@ impl Disk for SystemDisk {
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         fs::rename(from, to)
+    }
+
+    fn rename_new(&self, from: &Path, to: &Path) -> io::Result<()> {
+        rename_new(from, to)
     }
 
     fn remove_file(&self, path: &Path) -> io::Result<()> {

@@ -146,6 +146,41 @@ impl FaultyStorage {
     fn crash(&self) {
         self.state().crashed = true;
     }
+
+    /// Does a write, and what is ordered for it.
+    async fn faulty_write<'a, T>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+        write: impl FnOnce(Bytes) -> BoxFuture<'a, Result<T, StorageError>>,
+    ) -> Result<T, StorageError> {
+        self.alive(name)?;
+        match self.next_write(bytes.len()) {
+            None => write(bytes).await,
+            Some(WriteFault::Fail) => Err(failure("this write was ordered to fail", name)),
+            Some(WriteFault::Full) => Err(StorageError::Full {
+                source: io::ErrorKind::StorageFull.into(),
+                path: name.to_owned(),
+            }),
+            Some(WriteFault::CrashBefore) => {
+                self.crash();
+                Err(failure("the storage crashed before this write", name))
+            }
+            Some(WriteFault::CrashAfter) => {
+                write(bytes).await?;
+                self.crash();
+                Err(failure("the storage crashed after this write", name))
+            }
+            Some(WriteFault::CutShort { kept }) => {
+                write(bytes.slice(..kept.min(bytes.len()))).await?;
+                self.crash();
+                Err(failure(
+                    "the storage crashed in the middle of this write",
+                    name,
+                ))
+            }
+        }
+    }
 }
 
 fn failure(what: &'static str, name: &str) -> StorageError {
@@ -181,36 +216,17 @@ impl Storage for FaultyStorage {
         name: &'a str,
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>> {
-        async move {
-            self.alive(name)?;
-            match self.next_write(bytes.len()) {
-                None => self.inner.write_durable(name, bytes).await,
-                Some(WriteFault::Fail) => Err(failure("this write was ordered to fail", name)),
-                Some(WriteFault::Full) => Err(StorageError::Full {
-                    source: io::ErrorKind::StorageFull.into(),
-                    path: name.to_owned(),
-                }),
-                Some(WriteFault::CrashBefore) => {
-                    self.crash();
-                    Err(failure("the storage crashed before this write", name))
-                }
-                Some(WriteFault::CrashAfter) => {
-                    self.inner.write_durable(name, bytes).await?;
-                    self.crash();
-                    Err(failure("the storage crashed after this write", name))
-                }
-                Some(WriteFault::CutShort { kept }) => {
-                    let kept = bytes.slice(..kept.min(bytes.len()));
-                    self.inner.write_durable(name, kept).await?;
-                    self.crash();
-                    Err(failure(
-                        "the storage crashed in the middle of this write",
-                        name,
-                    ))
-                }
-            }
-        }
-        .boxed()
+        let write = move |bytes| self.inner.write_durable(name, bytes);
+        self.faulty_write(name, bytes, write).boxed()
+    }
+
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        let create = move |bytes| self.inner.create_durable(name, bytes);
+        self.faulty_write(name, bytes, create).boxed()
     }
 
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
@@ -235,6 +251,10 @@ impl Storage for FaultyStorage {
             self.inner.size(name).await
         }
         .boxed()
+    }
+
+    fn settled(&self) -> BoxFuture<'_, ()> {
+        self.inner.settled()
     }
 
     fn read_cost(&self) -> u64 {

@@ -53,6 +53,15 @@ struct Inner {
     randomness: OnceLock<Arc<dyn Randomness>>,
 }
 
+/// How a finished file gets its name.
+#[derive(Clone, Copy)]
+enum Naming {
+    /// In place of what has it.
+    Replacing,
+    /// Only if nothing has it.
+    New,
+}
+
 /// What went wrong with a step of a write.
 enum WriteError {
     Io(io::Error),
@@ -247,7 +256,7 @@ impl Inner {
         }
     }
 
-    fn write(&self, path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
+    fn write(&self, path: &Path, bytes: &[u8], naming: Naming) -> Result<(), WriteError> {
         if self.stopped.load(Ordering::SeqCst) {
             let stopped = io::Error::other("an earlier sync failed, and nothing more is written");
             return Err(WriteError::Sync(stopped));
@@ -257,8 +266,9 @@ impl Inner {
         for _ in 1..WRITE_ATTEMPTS {
             self.check_root()?;
             let prepared = self.prepare(&incoming).and_then(|()| self.prepare(parent));
-            match prepared.and_then(|()| self.write_once(path, bytes)) {
+            match prepared.and_then(|()| self.write_once(path, bytes, naming)) {
                 Ok(()) => {
+                    // Also for another's, who may have died before.
                     self.disk.sync_dir(parent).map_err(WriteError::Sync)?;
                     // What was written to another folder meanwhile is not acknowledged.
                     return self.check_root();
@@ -276,7 +286,20 @@ impl Inner {
         Err(io::Error::other("other writers keep interfering").into())
     }
 
-    fn write_once(&self, path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
+    /// Writes an object unless there is one; what is there then.
+    fn create(&self, path: &Path, bytes: &[u8]) -> Result<Bytes, WriteError> {
+        for _ in 1..WRITE_ATTEMPTS {
+            self.write(path, bytes, Naming::New)?;
+            match self.disk.read(path, None) {
+                // It was another's, and is deleted.
+                Err(e) if e.kind() == io::ErrorKind::NotFound => {}
+                there => return Ok(there?),
+            }
+        }
+        Err(io::Error::other("others keep making and deleting it").into())
+    }
+
+    fn write_once(&self, path: &Path, bytes: &[u8], naming: Naming) -> Result<(), WriteError> {
         let number = match self.randomness.get() {
             Some(randomness) => randomness.next(),
             None => SystemRandomness.next(),
@@ -288,12 +311,21 @@ impl Inner {
         let mut write = || {
             file.write_all(bytes)?;
             file.sync().map_err(WriteError::Sync)?;
-            Ok(self.disk.rename(&temporary, path)?)
+            match naming {
+                Naming::Replacing => self.disk.rename(&temporary, path)?,
+                Naming::New => match self.disk.rename_new(&temporary, path) {
+                    Err(e) if e.kind() == io::ErrorKind::AlreadyExists => return Ok(false),
+                    named => named?,
+                },
+            }
+            Ok(true)
         };
-        write().inspect_err(|_| {
+        let written = write();
+        if !matches!(written, Ok(true)) {
             // Without this a full disk would stay full; a failure here changes nothing.
             let _ = self.disk.remove_file(&temporary);
-        })
+        }
+        written.map(|_| ())
     }
 
     /// Sees to it that a folder is there, and those above it down from the root, each entered
@@ -397,7 +429,17 @@ impl Storage for LocalStorage {
         name: &'a str,
         bytes: Bytes,
     ) -> BoxFuture<'a, Result<(), StorageError>> {
-        self.blocking(name, move |inner, path| inner.write(path, &bytes))
+        self.blocking(name, move |inner, path| {
+            inner.write(path, &bytes, Naming::Replacing)
+        })
+    }
+
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        self.blocking(name, move |inner, path| inner.create(path, &bytes))
     }
 
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {

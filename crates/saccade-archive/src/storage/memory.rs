@@ -85,6 +85,20 @@ impl Storage for MemoryStorage {
         .boxed()
     }
 
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        ready(check_name(name).map(|()| {
+            let object = (bytes, self.clock.now());
+            let mut objects = self.objects();
+            let (there, _) = objects.entry(name.to_owned()).or_insert(object);
+            there.clone()
+        }))
+        .boxed()
+    }
+
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
         let entries = self
             .objects()

@@ -11,7 +11,7 @@ use object_store::limit::LimitStore;
 use object_store::path::Path;
 use object_store::{
     BackoffConfig, ClientOptions, GetOptions, GetRange, ObjectMeta, ObjectStore,
-    ObjectStoreExt as _, PutMultipartOptions, RetryConfig, WriteMultipart,
+    ObjectStoreExt as _, PutMode, PutOptions, RetryConfig,
 };
 
 use super::{Entry, Storage, StorageError, check_name};
@@ -19,19 +19,21 @@ use crate::clock::{Clock as _, SystemClock};
 use crate::percent;
 
 mod location;
+mod parts;
 mod sort;
 
 pub use location::{BucketLocation, BucketLocationError};
-use sort::{missing_object, sorted};
+use parts::Uploads;
+use sort::{is_transport, knows_no_conditions, missing_object, sorted};
 
 /// Requests under way at once; more wait here rather than in the store.
 const REQUESTS: usize = 64;
 /// How often a request is made again: for three seconds, if the store answers at once.
 const RETRIES: usize = 5;
-/// How often a listing is begun again at most.
-const LISTINGS: u32 = 4;
-/// Time before it is begun for the second time; twice as long before each time after that.
-const LISTING_PAUSE: Duration = Duration::from_millis(100);
+/// How often something is done at most whose answer breaks off: the client asks again only for requests that get none.
+const TURNS: u32 = 4;
+/// Time before it is done for the second time; twice as long before each time after that.
+const PAUSE: Duration = Duration::from_millis(100);
 /// Settings of which one is there where requests can be signed, or need not be.
 const CREDENTIALS: [&str; 6] = [
     "aws_access_key_id",
@@ -42,11 +44,7 @@ const CREDENTIALS: [&str; 6] = [
     "aws_skip_signature",
 ];
 /// Longer objects are written in parts, so that one that fails costs little \[bytes\].
-const WHOLE: usize = 16 << 20;
-/// Length of a part \[bytes\]. At 280 kB/s one takes as long as a request may.
-const PART: usize = 8 << 20;
-/// Parts of one object on their way.
-const PARTS: usize = 4;
+pub(super) const WHOLE: usize = 16 << 20;
 /// What a request takes to begin, at a usual speed \[bytes\]: 10 ms at 50 MB/s.
 const READ_COST: u64 = 512 << 10;
 /// No store has longer objects \[bytes\]: S3's limit is 50 TB.
@@ -59,11 +57,13 @@ const LONGEST: u64 = 1 << 48;
 /// again for some seconds; then they fail as [`StorageError::Unavailable`]. What the store
 /// refuses (403, no such bucket, the wrong region) fails at once as [`StorageError::Refused`].
 ///
-/// A process that is killed while it writes a long object leaves its parts in the bucket, where no
+/// Long objects are written in parts, of which nobody sees anything before the store has put them together. What is
+/// given up is aborted; but a process that is killed, or whose store goes away, leaves its parts in the bucket, where no
 /// listing shows them. A lifecycle rule that aborts incomplete multipart uploads removes them.
 #[derive(Clone, Debug)]
 pub struct ObjectStorage {
     store: Arc<dyn ObjectStore>,
+    uploads: Arc<Uploads>,
     prefix: Path,
     location: Arc<str>,
 }
@@ -149,6 +149,7 @@ impl ObjectStorage {
     pub fn of(store: Arc<dyn ObjectStore>, prefix: &str, location: String) -> Self {
         Self {
             store,
+            uploads: Arc::new(Uploads::new()),
             // As it is, so that others find it under the name it was given.
             prefix: Path::parse(prefix).unwrap_or_else(|_| Path::from(prefix)),
             location: location.into(),
@@ -214,10 +215,18 @@ impl ObjectStorage {
             range: range.map(GetRange::Bounded),
             ..GetOptions::default()
         };
-        let read = async { self.store.get_opts(&path, options).await?.bytes().await };
-        let error = match read.await {
-            Ok(bytes) => return Ok(bytes),
-            Err(e) => self.failed(e, name),
+        let mut turns = 1..TURNS;
+        let error = loop {
+            let answer = match self.store.get_opts(&path, options.clone()).await {
+                Ok(answer) => answer,
+                Err(e) => break self.failed(e, name),
+            };
+            match answer.bytes().await {
+                Ok(bytes) => return Ok(bytes),
+                // The client reads on where an answer broke off, but not in what has taken the object's place.
+                Err(e) if is_transport(&e) && turns.next().is_some() => {}
+                Err(e) => break self.failed(e, name),
+            }
         };
         // A range that begins behind the end is refused, too.
         if matches!(error, StorageError::Refused { .. })
@@ -237,27 +246,48 @@ impl ObjectStorage {
         let written = if bytes.len() <= WHOLE {
             self.store.put(&path, bytes.into()).await.map(|_| ())
         } else {
-            self.write_in_parts(&path, bytes).await
+            self.uploads.write(&*self.store, &path, &bytes).await
         };
         written.map_err(|e| sorted(e, &format!("{}/{name}", self.location)))
     }
 
-    async fn write_in_parts(&self, path: &Path, bytes: Bytes) -> object_store::Result<()> {
-        let options = PutMultipartOptions::default();
-        let upload = self.store.put_multipart_opts(path, options).await?;
-        let mut upload = WriteMultipart::new_with_chunk_size(upload, PART);
-        for begin in (0..bytes.len()).step_by(PART) {
-            upload.wait_for_capacity(PARTS).await?;
-            upload.put(bytes.slice(begin..bytes.len().min(begin + PART)));
+    /// Writes an object unless there is one; what is there then.
+    async fn create(&self, name: &str, bytes: Bytes) -> Result<Bytes, StorageError> {
+        let path = self.path(name)?;
+        again(|| async {
+            let options = PutOptions::from(PutMode::Create);
+            let put = self.store.put_opts(&path, bytes.clone().into(), options);
+            let put = match put.await {
+                Err(e) if knows_no_conditions(&e) => self.create_by_looking(&path, &bytes).await,
+                put => put.map(|_| ()),
+            };
+            match put {
+                Ok(()) | Err(object_store::Error::AlreadyExists { .. }) => {}
+                Err(e) => return Err(sorted(e, &format!("{}/{name}", self.location))),
+            }
+            // What is there counts: an answer may have been lost, and the write been done again.
+            match self.read_some(name, None).await {
+                Err(StorageError::NotFound { .. }) => Err(StorageError::Unavailable {
+                    source: Box::new(undone(&path)),
+                    path: format!("{}/{name}", self.location),
+                }),
+                there => there,
+            }
+        })
+        .await
+    }
+
+    /// The same in a store that cannot do it in one step. Two that do this at once may both write.
+    async fn create_by_looking(&self, path: &Path, bytes: &Bytes) -> object_store::Result<()> {
+        match self.store.head(path).await {
+            Err(e) if missing_object(&e) => {
+                self.store.put(path, bytes.clone().into()).await.map(|_| ())
+            }
+            there => there.map(|_| ()),
         }
-        // Aborts if a part failed.
-        upload.finish().await?;
-        Ok(())
     }
 
     /// Objects whose names begin with `prefix`, at most so many, sorted by name.
-    ///
-    /// A listing whose answer broke off is begun again: the client asks again only for requests that get none.
     async fn entries_below(&self, prefix: &str, most: usize) -> Result<Vec<Entry>, StorageError> {
         // Stores list whole folders; `prefix` may end within a name.
         let folder = prefix.rsplit_once('/').map_or("", |(folder, _)| folder);
@@ -266,19 +296,15 @@ impl ObjectStorage {
             .parts()
             .chain(Path::from(folder).parts())
             .collect();
-        let mut pause = LISTING_PAUSE;
-        let mut begun = 1;
-        loop {
-            match self.list_once(&folder, prefix, most).await {
-                Err(e) if e.is_outage() && begun < LISTINGS => begun += 1,
-                Err(e) => return Err(e),
-                Ok(mut entries) => {
-                    entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
-                    return Ok(entries);
-                }
-            }
-            SystemClock.sleep(pause).await;
-            pause *= 2;
+        let mut entries = again(|| self.list_once(&folder, prefix, most)).await?;
+        entries.sort_unstable_by(|a, b| a.name.cmp(&b.name));
+        Ok(entries)
+    }
+
+    async fn delete_once(&self, name: &str) -> Result<(), StorageError> {
+        match self.store.delete(&self.path(name)?).await {
+            Err(e) if !missing_object(&e) => Err(self.failed(e, name)),
+            Ok(()) | Err(_) => Ok(()),
         }
     }
 
@@ -309,6 +335,29 @@ impl ObjectStorage {
     }
 }
 
+/// Does something again, some times, while its answer breaks off or the store is away.
+async fn again<T, F: Future<Output = Result<T, StorageError>>>(
+    once: impl Fn() -> F,
+) -> Result<T, StorageError> {
+    let mut pause = PAUSE;
+    for _ in 1..TURNS {
+        match once().await {
+            Err(e) if e.is_outage() => SystemClock.sleep(pause).await,
+            done => return done,
+        }
+        pause *= 2;
+    }
+    once().await
+}
+
+/// What is said of an object that is there, and then is not: another's write came to nothing.
+fn undone(path: &Path) -> object_store::Error {
+    object_store::Error::NotFound {
+        path: path.to_string(),
+        source: "another writes it, or deletes it, at this moment".into(),
+    }
+}
+
 impl Storage for ObjectStorage {
     fn read<'a>(
         &'a self,
@@ -326,6 +375,14 @@ impl Storage for ObjectStorage {
         self.write(name, bytes).boxed()
     }
 
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        self.create(name, bytes).boxed()
+    }
+
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
         self.entries_below(prefix, usize::MAX).boxed()
     }
@@ -335,17 +392,15 @@ impl Storage for ObjectStorage {
     }
 
     fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
-        async move {
-            match self.store.delete(&self.path(name)?).await {
-                Err(e) if !missing_object(&e) => Err(self.failed(e, name)),
-                Ok(()) | Err(_) => Ok(()),
-            }
-        }
-        .boxed()
+        again(|| self.delete_once(name)).boxed()
     }
 
     fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
         async move { Ok(self.head(name).await?.size) }.boxed()
+    }
+
+    fn settled(&self) -> BoxFuture<'_, ()> {
+        self.uploads.settled().boxed()
     }
 
     fn read_cost(&self) -> u64 {

@@ -541,6 +541,9 @@ delegate_disk!(Lax {
     fn rename(&self, from: &Path, to: &Path) -> std::io::Result<()> {
         self.disk.rename(from, to)
     }
+    fn rename_new(&self, from: &Path, to: &Path) -> std::io::Result<()> {
+        self.disk.rename_new(from, to)
+    }
     fn sync_dir(&self, path: &Path) -> std::io::Result<()> {
         if self.folders { self.disk.sync_dir(path) } else { Ok(()) }
     }
@@ -554,6 +557,10 @@ delegate_disk!(Naming {
     fn rename(&self, from: &Path, to: &Path) -> std::io::Result<()> {
         // The name is durable, and the content is not yet.
         self.disk.rename(from, to)?;
+        self.disk.sync_dir(to.parent().unwrap_or(Path::new("")))
+    }
+    fn rename_new(&self, from: &Path, to: &Path) -> std::io::Result<()> {
+        self.disk.rename_new(from, to)?;
         self.disk.sync_dir(to.parent().unwrap_or(Path::new("")))
     }
     fn sync_dir(&self, path: &Path) -> std::io::Result<()> {
@@ -586,6 +593,16 @@ impl Storage for Slow {
         let millis = 1 + self.randomness.next() % LONGEST_WRITE;
         self.clock.turn(Duration::from_millis(millis));
         self.inner.write_durable(name, bytes)
+    }
+
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        let millis = 1 + self.randomness.next() % LONGEST_WRITE;
+        self.clock.turn(Duration::from_millis(millis));
+        self.inner.create_durable(name, bytes)
     }
 
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
@@ -630,6 +647,14 @@ impl Storage for Hasty {
                 None => Ok(()),
             }
         })
+    }
+
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        self.inner.create_durable(name, bytes)
     }
 
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {

@@ -227,6 +227,21 @@ impl State {
         Ok(made)
     }
 
+    fn rename(&mut self, from: &Path, to: &Path) -> io::Result<()> {
+        let (old_folder, old_name) = self.place(from)?;
+        let (new_folder, new_name) = self.place(to)?;
+        let node = self.lookup(old_folder, &old_name)?;
+        let node = node.ok_or(io::ErrorKind::NotFound)?;
+        if let Some(there) = self.lookup(new_folder, &new_name)?
+            && matches!(self.nodes[there], Node::Dir { .. })
+        {
+            return Err(io::ErrorKind::IsADirectory.into());
+        }
+        self.change(new_folder, new_name, Some(node));
+        self.change(old_folder, old_name, None);
+        Ok(())
+    }
+
     fn walk(&self, at: usize, name: &str, found: &mut Vec<String>) {
         match &self.nodes[at] {
             Node::File { .. } => found.push(name.to_owned()),
@@ -396,18 +411,15 @@ impl Disk for SimulatedDisk {
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         let (mut state, _) = self.step()?;
-        let (old_folder, old_name) = state.place(from)?;
-        let (new_folder, new_name) = state.place(to)?;
-        let node = state.lookup(old_folder, &old_name)?;
-        let node = node.ok_or(io::ErrorKind::NotFound)?;
-        if let Some(there) = state.lookup(new_folder, &new_name)?
-            && matches!(state.nodes[there], Node::Dir { .. })
-        {
-            return Err(io::ErrorKind::IsADirectory.into());
+        state.rename(from, to)
+    }
+
+    fn rename_new(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let (mut state, _) = self.step()?;
+        if state.find(to).is_ok() {
+            return Err(io::ErrorKind::AlreadyExists.into());
         }
-        state.change(new_folder, new_name, Some(node));
-        state.change(old_folder, old_name, None);
-        Ok(())
+        state.rename(from, to)
     }
 
     fn remove_file(&self, path: &Path) -> io::Result<()> {

@@ -127,6 +127,64 @@ async fn folders_that_others_made_are_made_durable() {
     }
 }
 
+/// Whoever heard of one, and whoever comes after the power was cut, have the same.
+#[tokio::test]
+async fn what_is_created_is_one_for_all_whenever_the_power_is_cut() {
+    let path = Path::new("root");
+    let (mut cuts, mut heard_before_a_cut) = (0, 0);
+    for cut in 0.. {
+        let disk = SimulatedDisk::new();
+        let open = |disk: SimulatedDisk| LocalStorage::on(Arc::new(disk), path).unwrap();
+        let [one, other] = [(); 2].map(|()| open(disk.clone()));
+        disk.cut_power_at(cut);
+        let create =
+            |storage: LocalStorage, bytes| async move { storage.create_durable("a", bytes).await };
+        let both = futures::join!(
+            create(one, Bytes::from_static(b"one's")),
+            create(other, Bytes::from_static(b"the other's"))
+        );
+        let heard: Vec<Bytes> = [both.0, both.1].into_iter().flatten().collect();
+        assert!(heard.windows(2).all(|w| w[0] == w[1]), "{heard:?}");
+        for seed in 0..100 {
+            let left = open(disk.after_crash(&mut super::super::Crash::new(seed)));
+            let late = left.create_durable("a", Bytes::from_static(b"late"));
+            let there = late.await.unwrap();
+            let told = heard.first().unwrap_or(&there);
+            assert_eq!(there, told, "cut {cut}, seed {seed}");
+            let whole = [&b"one's"[..], b"the other's", b"late"].contains(&&there[..]);
+            assert!(whole, "cut {cut}, seed {seed}: {there:?}");
+        }
+        cuts += 1;
+        heard_before_a_cut += u32::from(heard.len() == 1);
+        if heard.len() == 2 {
+            break;
+        }
+    }
+    assert!(
+        cuts > 8 && heard_before_a_cut > 0,
+        "{cuts} cuts, {heard_before_a_cut}"
+    );
+}
+
+/// Its maker died before its name was durable.
+#[tokio::test]
+async fn what_another_created_is_durable_before_it_is_told() {
+    let disk = SimulatedDisk::new();
+    let storage = LocalStorage::on(Arc::new(disk.clone()), "root").unwrap();
+    let temporary = Path::new("root").join(INCOMING).join("theirs");
+    let mut file = disk.create_new(&temporary).unwrap();
+    file.write_all(b"theirs").unwrap();
+    file.sync().unwrap();
+    disk.rename_new(&temporary, Path::new("root/a")).unwrap();
+    let created = storage.create_durable("a", Bytes::from_static(b"ours"));
+    assert_eq!(created.await.unwrap(), b"theirs"[..]);
+    for seed in 0..50 {
+        let left = disk.after_crash(&mut super::super::Crash::new(seed));
+        let read = left.read(Path::new("root/a"), None).unwrap();
+        assert_eq!(read, b"theirs"[..]);
+    }
+}
+
 #[tokio::test]
 async fn abandoned_temporaries_go_and_living_ones_stay() {
     let dir = tempfile::tempdir().unwrap();

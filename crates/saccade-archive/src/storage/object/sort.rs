@@ -46,6 +46,16 @@ pub(super) fn missing_object(error: &Error) -> bool {
     matches!(error, Error::NotFound { .. }) && !says(error, "NoSuchBucket")
 }
 
+/// Whether the store knows nothing of an upload in parts any more: it was aborted, or is complete.
+pub(super) fn lost_upload(error: &Error) -> bool {
+    says(error, "NoSuchUpload")
+}
+
+/// Whether the store cannot write an object only if there is none.
+pub(super) fn knows_no_conditions(error: &Error) -> bool {
+    matches!(error, Error::NotImplemented { .. }) || status(error) == Some(501)
+}
+
 fn says(error: &Error, what: &str) -> bool {
     causes(error).iter().any(|text| text.contains(what))
 }
@@ -54,6 +64,12 @@ fn says(error: &Error, what: &str) -> bool {
 pub(super) fn sorted(error: Error, path: &str) -> StorageError {
     let path = path.to_owned();
     let status = status(&error);
+    if lost_upload(&error) {
+        return StorageError::Unavailable {
+            source: Box::new(error),
+            path,
+        };
+    }
     let advice = if says(&error, "NoSuchBucket") || matches!(error, Error::NotFound { .. }) {
         "there is no such bucket; make it first, or check its name and AWS_ENDPOINT_URL"
     } else if says(&error, "AuthorizationHeaderMalformed")
@@ -91,6 +107,6 @@ pub(super) fn sorted(error: Error, path: &str) -> StorageError {
 }
 
 /// Whether the request did not get there, or its answer not back.
-fn is_transport(error: &Error) -> bool {
+pub(super) fn is_transport(error: &Error) -> bool {
     chain(error).any(|e| e.is::<object_store::client::HttpError>())
 }

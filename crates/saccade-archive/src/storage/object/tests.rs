@@ -1,5 +1,5 @@
-//! A server on loopback that answers as told, and what becomes of its answers. A real S3 server is
-//! asked in `tests/s3`.
+//! A server on loopback that answers as told, and what becomes of its answers. A real S3 server is asked by [`server`],
+//! and in `tests/s3`.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -8,6 +8,8 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 
 use super::*;
+
+mod server;
 
 #[tokio::test]
 async fn conforms() {
@@ -33,14 +35,6 @@ async fn prefixes_keep_apart() {
     assert_eq!(all.list("").await.unwrap(), ["a/x", "a2/x"]);
     a.delete("x").await.unwrap();
     assert_eq!(b.read("x", None).await.unwrap(), b"b"[..]);
-}
-
-#[tokio::test]
-async fn long_objects_come_back_as_they_were() {
-    let storage = ObjectStorage::of(Arc::new(InMemory::new()), "", "memory".to_owned());
-    let bytes: Bytes = (0..=250u8).cycle().take(WHOLE + PART + 3).collect();
-    storage.write_durable("long", bytes.clone()).await.unwrap();
-    assert!(storage.read("long", None).await.unwrap() == bytes);
 }
 
 /// Answers each request with the next of `answers`, the last one for ever. Returns its address and
@@ -93,6 +87,15 @@ const WRITTEN: &str =
     "HTTP/1.1 200 OK\r\netag: \"a\"\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
 const REST: &str = "HTTP/1.1 206 Partial Content\r\netag: \"a\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:00 GMT\r\ncontent-range: bytes 2-2/3\r\ncontent-length: 1\r\nconnection: close\r\n\r\nc";
 const SHORT: &str = "HTTP/1.1 200 OK\r\netag: \"a\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:00 GMT\r\ncontent-length: 3\r\nconnection: close\r\n\r\nab";
+
+const REST_OF_ANOTHER: &str = "HTTP/1.1 206 Partial Content\r\netag: \"b\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:01 GMT\r\ncontent-range: bytes 2-2/3\r\ncontent-length: 1\r\nconnection: close\r\n\r\nz";
+const ANOTHER: &str = "HTTP/1.1 200 OK\r\netag: \"b\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:01 GMT\r\ncontent-length: 3\r\nconnection: close\r\n\r\nxyz";
+const EXISTS: &str =
+    "HTTP/1.1 412 Precondition Failed\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+const CONFLICT: &str = "HTTP/1.1 409 Conflict\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+const NOT_IMPLEMENTED: &str =
+    "HTTP/1.1 501 Not Implemented\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
+const ABC: &str = "HTTP/1.1 200 OK\r\netag: \"a\"\r\nlast-modified: Sun, 22 Nov 2026 12:00:00 GMT\r\ncontent-length: 3\r\nconnection: close\r\n\r\nabc";
 
 const LIST: &str = concat!(
     "HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n<ListBucketResult><IsTruncated>false</IsTruncated>",
@@ -158,6 +161,15 @@ async fn what_passes_is_asked_again() {
     assert_eq!(asked.load(Ordering::SeqCst), 3);
 }
 
+/// What has taken the place of what was being read is read from its beginning.
+#[tokio::test]
+async fn what_changes_while_it_is_read_is_read_anew() {
+    let (url, asked) = server(vec![SHORT, REST_OF_ANOTHER, ANOTHER]).await;
+    let read = storage(&url, &[]).read("a", None).await.unwrap();
+    assert_eq!(read, b"xyz"[..]);
+    assert_eq!(asked.load(Ordering::SeqCst), 3);
+}
+
 /// A listing that breaks off in its midst is whole in the end, or an outage; never a part of it.
 #[tokio::test]
 async fn listings_that_break_off_are_begun_again() {
@@ -192,6 +204,51 @@ async fn what_does_not_pass_is_an_outage() {
         assert!(error.is_outage() && error.is_transient());
         assert!(asked.load(Ordering::SeqCst) >= 4, "{answer}");
     }
+}
+
+/// Whatever happens on the way: what is there in the end is what counts.
+#[tokio::test]
+async fn what_is_created_is_what_is_there() {
+    for answers in [
+        vec![WRITTEN, ABC],
+        vec![EXISTS, ABC],
+        // Another's write comes to nothing, or is deleted at once.
+        vec![CONFLICT, NO_KEY, WRITTEN, ABC],
+        // The answer is lost, and it is done again.
+        vec!["", EXISTS, ABC],
+        vec![BUSY, WRITTEN, SHORT, REST],
+        // A store that knows no conditions is asked whether it is there, as often as the client asks again.
+        vec![
+            NOT_IMPLEMENTED,
+            NOT_IMPLEMENTED,
+            NOT_IMPLEMENTED,
+            NOT_IMPLEMENTED,
+            NO_KEY,
+            WRITTEN,
+            ABC,
+        ],
+        vec![
+            NOT_IMPLEMENTED,
+            NOT_IMPLEMENTED,
+            NOT_IMPLEMENTED,
+            NOT_IMPLEMENTED,
+            ABC,
+            ABC,
+        ],
+    ] {
+        let (url, asked) = server(answers.clone()).await;
+        let storage = storage(&url, &[]);
+        let own = Bytes::from_static(b"own");
+        let there = storage.create_durable("a", own).await.unwrap();
+        assert_eq!(there, b"abc"[..], "{answers:?}");
+        assert_eq!(asked.load(Ordering::SeqCst), answers.len(), "{answers:?}");
+    }
+    let (url, _) = server(vec![FORBIDDEN]).await;
+    let refused = storage(&url, &[]).create_durable("a", Bytes::new()).await;
+    assert!(
+        matches!(refused, Err(StorageError::Refused { .. })),
+        "{refused:?}"
+    );
 }
 
 /// Nobody listens there, and nobody chose who encrypts: neither is a panic.

@@ -89,6 +89,14 @@ impl Storage for Turnstile {
         self.inner.write_durable(name, bytes)
     }
 
+    fn create_durable<'a>(
+        &'a self,
+        name: &'a str,
+        bytes: Bytes,
+    ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+        self.inner.create_durable(name, bytes)
+    }
+
     fn entries<'a>(&'a self, prefix: &'a str) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
         self.inner.entries(prefix)
     }
