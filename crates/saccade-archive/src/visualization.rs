@@ -207,6 +207,16 @@ impl VisualizationArchive {
         identity::make(catalog, storage, location, &*self.randomness).await
     }
 
+    /// What tells the storage from every other: its [`IDENTITY`], which it gets if it has none, also from who only reads.
+    /// `None` if it is damaged: then it tells nothing until `saccade ingest` writes it anew.
+    ///
+    /// # Errors
+    ///
+    /// [`ArchiveError`], as where nothing can be written.
+    pub async fn own_identity(&self) -> Result<Option<String>, ArchiveError> {
+        identity::own(&self.catalog, &*self.storage, &*self.randomness).await
+    }
+
     /// Which tiles there are.
     pub fn catalog(&self) -> &Catalog {
         &self.catalog

@@ -251,8 +251,8 @@ impl StitchedSource {
         let disk = match options.disk_cache.clone() {
             Some(disk) => {
                 let place = catalog.location().to_string();
-                let identity = disk_cache::identity(&**archive.storage()).await;
-                identity.map(|identity| (disk, [&identity[..], place.as_bytes()].concat()))
+                let identity = disk_cache::identity(archive).await;
+                identity.map(|identity| (disk, (identity + &place).into_bytes()))
             }
             None => None,
         };

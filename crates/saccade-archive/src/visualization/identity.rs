@@ -1,7 +1,8 @@
 //! Whether a catalog and a storage are parts of one archive.
 //!
-//! Both get the same random identity when the archive is made: the catalog in a table, the storage in an
-//! object. Where one of them has none, made by an earlier version or lost, or the object is damaged, it counts
+//! Both get the same random identity when the archive is made: the storage in an object, and then the catalog in a
+//! table. An object that is not there yet is written only if it still is not: also who reads an archive of an earlier
+//! version may give it one, and of several all take the one that is kept. Where one of them has none, made by an earlier version or lost, or the object is damaged, it counts
 //! whether any of the pyramids that the catalog names are there.
 //!
 //! A catalog that knows of nothing does not belong to a storage that holds pyramids: they are another's, or their
@@ -46,6 +47,13 @@ enum Mark {
     Damaged,
 }
 
+impl Mark {
+    /// What an object says.
+    fn of(bytes: &[u8]) -> Self {
+        read_identity(bytes).map_or(Self::Damaged, Self::Whole)
+    }
+}
+
 /// What both parts say of themselves.
 struct Parts {
     catalog: Option<String>,
@@ -55,7 +63,7 @@ struct Parts {
 impl Parts {
     async fn read(catalog: &Catalog, storage: &dyn Storage) -> Result<Self, ArchiveError> {
         let mark = match storage.read(IDENTITY, None).await {
-            Ok(bytes) => read_identity(&bytes).map_or(Mark::Damaged, Mark::Whole),
+            Ok(bytes) => Mark::of(&bytes),
             Err(StorageError::NotFound { .. }) => Mark::None,
             Err(error) => return Err(error.into()),
         };
@@ -163,33 +171,63 @@ pub(super) async fn make(
         return Ok(());
     }
     let there = match parts.storage {
-        Mark::Whole(identity) => Some(identity),
-        Mark::None => None,
-        Mark::Damaged => {
+        Mark::None => created(parts.catalog.clone(), storage, randomness).await?,
+        there => there,
+    };
+    let identity = match &there {
+        Mark::Whole(there) => catalog.give_identity(there).await?,
+        Mark::None | Mark::Damaged => {
             log::warn!(
                 "the object {IDENTITY:?} of {} was damaged, and is written anew: pyramids that its catalog names \
                  are there",
                 location.storage()
             );
-            None
+            // The catalog decides, where several processes do this at once.
+            let proposed = parts.catalog.unwrap_or_else(|| random(randomness));
+            let identity = catalog.give_identity(&proposed).await?;
+            storage.write_durable(IDENTITY, line(&identity)).await?;
+            identity
         }
     };
-    // The catalog decides, where several processes do this at once.
-    let proposed = there
-        .clone()
-        .or(parts.catalog)
-        .unwrap_or_else(|| random(randomness));
-    let identity = catalog.give_identity(&proposed).await?;
     catalog.belongs_to(&identity);
     match there {
-        Some(there) if there == identity => {}
-        Some(_) => return Err(strangers(location)),
-        None => {
-            let line = Bytes::from(format!("{identity}\n"));
-            storage.write_durable(IDENTITY, line).await?;
-        }
+        Mark::Whole(there) if there != identity => Err(strangers(location)),
+        _ => Ok(()),
     }
-    Ok(())
+}
+
+/// What a storage has as its identity, which it gets if it has none: its catalog's, or one that is drawn. The catalog is left
+/// as it is.
+pub(super) async fn own(
+    catalog: &Catalog,
+    storage: &dyn Storage,
+    randomness: &dyn Randomness,
+) -> Result<Option<String>, ArchiveError> {
+    let parts = Parts::read(catalog, storage).await?;
+    let mark = match parts.storage {
+        Mark::None => created(parts.catalog, storage, randomness).await?,
+        mark => mark,
+    };
+    Ok(match mark {
+        Mark::Whole(identity) => Some(identity),
+        Mark::None | Mark::Damaged => None,
+    })
+}
+
+/// Gives an identity to a storage that has none; what it has then may be another's who did so at the same time.
+async fn created(
+    proposed: Option<String>,
+    storage: &dyn Storage,
+    randomness: &dyn Randomness,
+) -> Result<Mark, StorageError> {
+    let proposed = proposed.unwrap_or_else(|| random(randomness));
+    let there = storage.create_durable(IDENTITY, line(&proposed)).await?;
+    Ok(Mark::of(&there))
+}
+
+/// What [`IDENTITY`] holds.
+fn line(identity: &str) -> Bytes {
+    Bytes::from(format!("{identity}\n"))
 }
 
 /// Refuses a place that holds pyramids, but whose catalog is a file that is not there: before one is made, or what
@@ -227,8 +265,12 @@ fn unnamed(location: &ArchiveLocation) -> ArchiveError {
 
 #[cfg(test)]
 mod tests {
+    use std::ops::Range;
     use std::path::Path;
+    use std::sync::Arc;
 
+    use futures::FutureExt as _;
+    use futures::future::BoxFuture;
     use glam::{DVec2, DVec3, UVec2, UVec3};
     use saccade_core::transform::SectionFromTile;
     use saccade_core::volume::Volume;
@@ -237,7 +279,7 @@ mod tests {
     use crate::VisualizationArchive;
     use crate::catalog::NewTile;
     use crate::randomness::SystemRandomness;
-    use crate::storage::LocalStorage;
+    use crate::storage::{Entry, LocalStorage, MemoryStorage};
 
     /// An archive of one tile, as an earlier version made it if it is to have no identity.
     async fn made(folder: &Path, old: bool) {
@@ -275,7 +317,7 @@ mod tests {
 
     async fn mark(storage: &dyn Storage) -> Mark {
         match storage.read(IDENTITY, None).await {
-            Ok(bytes) => read_identity(&bytes).map_or(Mark::Damaged, Mark::Whole),
+            Ok(bytes) => Mark::of(&bytes),
             Err(_) => Mark::None,
         }
     }
@@ -463,6 +505,114 @@ mod tests {
             std::fs::remove_file(empty.join(IDENTITY)).unwrap();
             assert!(!is_refused(VisualizationArchive::create(&empty).await));
         }
+    }
+
+    /// Another process is always a little quicker to give it an identity.
+    #[derive(Debug)]
+    struct Contested(MemoryStorage, String);
+
+    impl Contested {
+        fn new() -> Self {
+            Self(MemoryStorage::new(), random(&SystemRandomness))
+        }
+
+        async fn lose(&self, name: &str) {
+            if name == IDENTITY {
+                let theirs = self.0.create_durable(IDENTITY, line(&self.1));
+                theirs.await.unwrap();
+            }
+        }
+    }
+
+    impl Storage for Contested {
+        fn read<'a>(
+            &'a self,
+            name: &'a str,
+            range: Option<Range<u64>>,
+        ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+            self.0.read(name, range)
+        }
+
+        fn write_durable<'a>(
+            &'a self,
+            name: &'a str,
+            bytes: Bytes,
+        ) -> BoxFuture<'a, Result<(), StorageError>> {
+            async move {
+                self.lose(name).await;
+                self.0.write_durable(name, bytes).await
+            }
+            .boxed()
+        }
+
+        fn create_durable<'a>(
+            &'a self,
+            name: &'a str,
+            bytes: Bytes,
+        ) -> BoxFuture<'a, Result<Bytes, StorageError>> {
+            async move {
+                self.lose(name).await;
+                self.0.create_durable(name, bytes).await
+            }
+            .boxed()
+        }
+
+        fn entries<'a>(
+            &'a self,
+            prefix: &'a str,
+        ) -> BoxFuture<'a, Result<Vec<Entry>, StorageError>> {
+            self.0.entries(prefix)
+        }
+
+        fn delete<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<(), StorageError>> {
+            self.0.delete(name)
+        }
+
+        fn size<'a>(&'a self, name: &'a str) -> BoxFuture<'a, Result<u64, StorageError>> {
+            self.0.size(name)
+        }
+    }
+
+    /// Who only reads an archive of an earlier version gives it one as well.
+    #[tokio::test]
+    async fn of_two_that_give_an_identity_one_counts_for_both() {
+        for writes in [true, false] {
+            let folder = tempfile::tempdir().unwrap();
+            let location = ArchiveLocation::from(folder.path());
+            let catalog = Catalog::create(location.catalog()).await.unwrap();
+            let storage = Arc::new(Contested::new());
+            let archive = VisualizationArchive::from_parts(catalog, storage.clone());
+            let theirs = Some(storage.1.clone());
+            if writes {
+                archive.identify(&location).await.unwrap();
+                assert_eq!(archive.catalog().identity().await.unwrap(), theirs);
+            }
+            assert_eq!(archive.own_identity().await.unwrap(), theirs);
+            assert_eq!(mark(&*storage).await, Mark::Whole(storage.1.clone()));
+            archive.identify(&location).await.unwrap();
+        }
+    }
+
+    /// An earlier version gave it to the catalog first, and may have been killed in between.
+    #[tokio::test]
+    async fn a_storage_without_identity_gets_its_catalogs() {
+        let folder = tempfile::tempdir().unwrap();
+        let one = folder.path().join("one");
+        made(&one, false).await;
+        let archive = VisualizationArchive::open(&one).await.unwrap();
+        let (catalog, storage) = (archive.catalog(), archive.storage());
+        let identity = catalog.identity().await.unwrap();
+        storage.delete(IDENTITY).await.unwrap();
+        assert_eq!(archive.own_identity().await.unwrap(), identity);
+        assert!(!is_refused(VisualizationArchive::create(&one).await));
+        // A damaged one tells nothing, and is left as it is.
+        let damaged = Bytes::from_static(b"half of o");
+        storage
+            .write_durable(IDENTITY, damaged.clone())
+            .await
+            .unwrap();
+        assert_eq!(archive.own_identity().await.unwrap(), None);
+        assert_eq!(storage.read(IDENTITY, None).await.unwrap(), damaged);
     }
 
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -17,7 +17,6 @@ use std::collections::BTreeSet;
 use std::error::Error;
 use std::fmt;
 use std::fs::File;
-use std::hash::{BuildHasher, Hasher, RandomState};
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -27,8 +26,7 @@ use foyer::{
     BlockEngineConfig, DeviceBuilder, FsDeviceBuilder, HybridCache, HybridCacheBuilder, Load,
     PsyncIoEngineConfig, RecoverMode,
 };
-use saccade_archive::storage::{Storage, StorageError};
-use saccade_archive::{IDENTITY, read_identity};
+use saccade_archive::{IDENTITY, VisualizationArchive};
 
 /// Least unit in which the cache is written over \[bytes\]: several blocks of voxels. Each is a file.
 const UNIT: u64 = 64 << 20;
@@ -399,31 +397,23 @@ fn prepare(folder: &Path, units: Units) -> io::Result<Prepared> {
 }
 
 /// What tells an archive from every other, made if it has none; `None` where it cannot be written.
-pub(super) async fn identity(storage: &dyn Storage) -> Option<Bytes> {
-    match storage.read(IDENTITY, None).await {
-        Ok(identity) if read_identity(&identity).is_some() => return Some(identity),
-        Ok(_) => {
+pub(super) async fn identity(archive: &VisualizationArchive) -> Option<String> {
+    match archive.own_identity().await {
+        Ok(Some(identity)) => Some(identity + "\n"),
+        Ok(None) => {
             log::warn!(
                 "the cache on disk is not used: the archive's object {IDENTITY:?} is damaged; `saccade ingest` \
                  writes it anew"
             );
-            return None;
+            None
         }
-        Err(StorageError::NotFound { .. }) => {}
         Err(error) => {
-            log::warn!("the cache on disk is not used: {error}");
-            return None;
+            log::warn!(
+                "the cache on disk is not used, as the archive cannot be told from others: {error}"
+            );
+            None
         }
     }
-    let random = || RandomState::new().build_hasher().finish();
-    let identity = Bytes::from(format!("{:016x}{:016x}\n", random(), random()));
-    let written = storage.write_durable(IDENTITY, identity).await;
-    if let Err(error) = written {
-        log::warn!("the cache on disk is not used for an archive that cannot be written: {error}");
-        return None;
-    }
-    // Another process may have done the same at the same time.
-    storage.read(IDENTITY, None).await.ok()
 }
 
 #[cfg(test)]
