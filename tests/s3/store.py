@@ -1,14 +1,24 @@
-"""An S3 server on loopback, and what stands between it and its clients: a proxy that loses, delays and refuses."""
+"""An S3 server on loopback, and what stands between it and its clients: a proxy that loses, delays and refuses.
 
+Run by itself, it serves tests in other languages: prints its address, serves until its input ends, and prints how often
+each fault happened and the parts of uploads that are left. `busy=0.1` among its arguments has a tenth of the requests meet that
+fault. An object called `part-lost` meets that one when its first part is sent, and others likewise.
+"""
+
+import contextlib
 import http.client
 import http.server
+import json
 import logging
 import random
 import socket
 import struct
+import sys
 import threading
 import time
 from collections import Counter
+from urllib.parse import parse_qs, urlsplit
+from xml.etree import ElementTree
 
 from botocore.auth import S3SigV4Auth
 from botocore.awsrequest import AWSRequest
@@ -43,8 +53,6 @@ class Store:
 
     def names(self, prefix):
         """Of the objects below a prefix, without it."""
-        from xml.etree import ElementTree
-
         names, more = [], ""
         while True:
             _, page = self.request("GET", f"/{BUCKET}?list-type=2&prefix={prefix}/{more}")
@@ -60,6 +68,17 @@ class Store:
         status, body = self.request("GET", f"/{BUCKET}/{prefix}/{name}")
         return body if status == 200 else None
 
+    def uploads(self, prefix):
+        """Numbers of the parts of each upload below a prefix that was begun and neither completed nor aborted."""
+        _, listed = self.request("GET", f"/{BUCKET}?uploads")
+        found = []
+        for upload in elements(listed, "Upload"):
+            key, number = [next(upload.iter(upload.tag.replace("Upload", name))).text for name in ("Key", "UploadId")]
+            if key.startswith(prefix + "/" if prefix else ""):
+                _, parts = self.request("GET", f"/{BUCKET}/{key}?uploadId={number}")
+                found.append([int(part.text) for part in elements(parts, "PartNumber")])
+        return found
+
     def put_folder(self, folder, bucket, prefix):
         for path in folder.rglob("*"):
             if path.is_file():
@@ -68,6 +87,20 @@ class Store:
 
     def close(self):
         self.server.stop()
+
+
+def elements(xml, name):
+    """Elements of a name, in whatever space they are."""
+    return [element for element in ElementTree.fromstring(xml).iter() if element.tag.rpartition("}")[2] == name]
+
+
+def kind_of(method, query):
+    """What a request is for: a step of an upload in parts, or its method."""
+    if method == "POST" and "uploads" in query:
+        return "begin"
+    if "uploadId" in query:
+        return {"PUT": "part", "POST": "complete", "DELETE": "abort"}.get(method, method)
+    return method
 
 
 def refusal(method, path, headers):
@@ -88,7 +121,11 @@ def refusal(method, path, headers):
 
 
 class Proxy:
-    """Forwards requests to the store, or does one of FAULTS to them."""
+    """Forwards requests to the store, or does one of FAULTS to them.
+
+    Two more faults are for those who kill the client meanwhile: "hold" forwards nothing, and "withhold" does, but neither
+    answers before `release`.
+    """
 
     FAULTS = ["busy", "reset", "lost", "cut", "drip"]
 
@@ -96,6 +133,15 @@ class Proxy:
         self.random = random.Random(seed)
         self.lock = threading.Lock()
         self.faults = {}
+        # Which fault befalls a request, by its kind, its object, and how many of that kind there were for it before.
+        self.order = lambda kind, path, nth: None
+        self.kinds = Counter()
+        self.release = threading.Event()
+        self.withheld = 0
+        # Uploads that are over. Of these the store knows nothing, as S3's documentation has it; moto is more lenient.
+        self.ended = set()
+        # moto looks whether there is an object, and then writes it.
+        self.conditional = threading.Lock()
         # Whether signatures are checked; whether each question is refused when it is asked for the first time.
         self.checks = False
         self.busy_at_first = False
@@ -111,7 +157,11 @@ class Proxy:
 
             def handle_any(self):
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-                fault = proxy.next_fault(self.command)
+                url = urlsplit(self.path)
+                query = parse_qs(url.query, keep_blank_values=True)
+                kind = kind_of(self.command, query)
+                upload = query.get("uploadId", [None])[0]
+                fault = proxy.next_fault(self.command, kind, url.path)
                 time.sleep(proxy.latency)
                 signed = self.headers.get("Authorization") is not None
                 if proxy.checks:
@@ -125,17 +175,27 @@ class Proxy:
                     return self.answer(503, [], b"<Error><Code>SlowDown</Code></Error>")
                 if fault == "denied":
                     return self.answer(403, [], b"<Error><Code>AccessDenied</Code></Error>")
-                if fault == "reset":
+                if fault == "hold":
+                    proxy.release.wait()
+                if fault in ("reset", "hold"):
                     return self.reset()
+                if upload in proxy.ended:
+                    return self.answer(404, [], b"<Error><Code>NoSuchUpload</Code></Error>", fault)
                 connection = http.client.HTTPConnection(store.host, store.port, timeout=20)
                 headers = {k: v for k, v in self.headers.items() if k.lower() != "connection"}
                 if not signed:  # The buckets of moto's are nobody's but their owner's.
                     headers.update(store.SIGNED)
-                connection.request(self.command, self.path, body, headers)
-                answer = connection.getresponse()
-                content = answer.read()
+                with proxy.conditional if self.headers.get("If-None-Match") else contextlib.nullcontext():
+                    connection.request(self.command, self.path, body, headers)
+                    answer = connection.getresponse()
+                    content = answer.read()
                 connection.close()
-                if fault == "lost":  # The store did it; nobody hears of it.
+                if kind in ("complete", "abort") and answer.status < 300:
+                    proxy.ended.add(upload)
+                if fault == "withhold":
+                    proxy.withheld += 1
+                    proxy.release.wait()
+                if fault in ("lost", "withhold"):  # The store did it; nobody hears of it.
                     return self.reset()
                 keep = [(k, v) for k, v in answer.getheaders()
                         if k.lower() not in ("connection", "transfer-encoding", "content-length")]
@@ -188,9 +248,15 @@ class Proxy:
         self.url = f"http://127.0.0.1:{self.server.server_port}"
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
-    def next_fault(self, method):
+    def next_fault(self, method, kind, path):
         with self.lock:
             self.requests[method] += 1
+            nth = self.kinds[kind, path]
+            self.kinds[kind, path] += 1
+            if ordered := self.order(kind, path, nth):
+                self.done[ordered] += 1
+                self.done[kind, ordered] += 1
+                return ordered
             drawn = self.random.random()
             for fault, share in self.faults.items():
                 drawn -= share
@@ -209,5 +275,27 @@ class Proxy:
             self.answers[answer] += 1
 
     def close(self):
+        self.release.set()
         self.server.shutdown()
         self.server.server_close()
+
+
+def fault_in_name(kind, path, nth):
+    """The fault that an object's name asks for."""
+    step, _, fault = path.rpartition("/")[2].partition("-")
+    return fault if kind == step and nth == 0 else None
+
+
+def main():
+    store = Store()
+    proxy = Proxy(store, time.time_ns())
+    proxy.faults = {fault: float(share) for fault, share in (argument.split("=") for argument in sys.argv[1:])}
+    proxy.order = fault_in_name
+    print(proxy.url, flush=True)
+    sys.stdin.read()
+    print(json.dumps({"faults": {name: n for name, n in proxy.done.items() if isinstance(name, str)},
+                      "uploads": store.uploads("")}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -34,6 +34,8 @@ const LOOK_FOR_THE_DEAD: Duration = Duration::from_secs(1);
 
 /// Retired pyramids deleted per look.
 const DELETE_AT_ONCE: u32 = 64;
+/// How long ending waits for what was given up.
+const SETTLING: Duration = Duration::from_secs(5);
 
 /// What was done.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -154,6 +156,11 @@ pub async fn run(
         Ok(Ok(())) => {}
         Ok(Err(e)) => log::warn!("claimed records are free again when the lease is over: {e}"),
         Err(_) => log::warn!("claimed records are free again when the lease is over"),
+    }
+    // What was given up in its midst would lie in an object store for ever.
+    let settled = archive.storage().settled();
+    if tokio::time::timeout(SETTLING, settled).await.is_err() {
+        log::warn!("parts of what was being written may be left in the object store, unseen");
     }
     done?;
     ingest.summary.early = catalog.statistics(&volume.name).await?.early;
