@@ -1,5 +1,7 @@
 //! Which tiles there are, and how many.
 
+use std::ops::Range;
+
 use super::database::{Durability, Row, Statement};
 use super::{Catalog, CatalogError, Statistics, Tile, TileId, rows};
 
@@ -97,6 +99,56 @@ impl Catalog {
         let question = "SELECT section FROM sections WHERE volume = $1 \
                         AND section BETWEEN 0 AND 4294967295 ORDER BY section";
         self.ask(question, &[id.into()], rows::section).await
+    }
+
+    /// Of each of the first `channels` channels, the sections of a range that have a tile of it, ascending. A tile of which
+    /// the channel cannot be told counts for all of them: whoever looks for it is to learn that it cannot be read.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::sections`].
+    pub async fn sections_of_channels(
+        &self,
+        volume: &str,
+        channels: u32,
+        within: Range<u32>,
+    ) -> Result<Vec<Vec<u32>>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        // Looks each pair up in the tiles' index; of one channel, the counts say the same.
+        let question = match channels {
+            0 | 1 => {
+                "SELECT section, CAST(0 AS BIGINT) AS channel FROM sections WHERE volume = $1 \
+                 AND section >= $2 AND section < $3 AND CAST(0 AS BIGINT) < $4 ORDER BY section"
+            }
+            _ => {
+                "WITH RECURSIVE channels (channel) AS (SELECT CAST(0 AS BIGINT) \
+                 UNION ALL SELECT channel + 1 FROM channels WHERE channel + 1 < $4) \
+                 SELECT s.section AS section, c.channel AS channel \
+                 FROM sections s CROSS JOIN channels c \
+                 WHERE s.volume = $1 AND s.section >= $2 AND s.section < $3 AND (\
+                 EXISTS (SELECT 1 FROM tiles t WHERE t.volume = $1 AND t.section = s.section \
+                 AND t.channel = c.channel AND t.deleted = 0) \
+                 OR EXISTS (SELECT 1 FROM tiles t WHERE t.volume = $1 AND t.section = s.section \
+                 AND t.channel < 0 AND t.deleted = 0) \
+                 OR EXISTS (SELECT 1 FROM tiles t WHERE t.volume = $1 AND t.section = s.section \
+                 AND t.channel > 4294967295 AND t.deleted = 0)) ORDER BY s.section"
+            }
+        };
+        let values = [
+            id.into(),
+            within.start.into(),
+            within.end.into(),
+            channels.into(),
+        ];
+        let pair = |row: &Row| Ok((rows::section(row)?, row.get::<i64>("channel")?));
+        let mut of_channels = vec![Vec::new(); channels as usize];
+        for (section, channel) in self.ask(question, &values, pair).await? {
+            let channel = usize::try_from(channel).ok();
+            if let Some(sections) = channel.and_then(|channel| of_channels.get_mut(channel)) {
+                sections.push(section);
+            }
+        }
+        Ok(of_channels)
     }
 
     /// The sections that have a tile, by looking at the tiles themselves: what [`Self::sections`] should say.

@@ -50,6 +50,7 @@ on_both! {
     suite::a_commit_happens_whole_or_not_at_all,
     suite::tiles_are_found_by_id,
     suite::sections_are_those_with_tiles,
+    suite::channels_have_the_sections_of_their_tiles,
     suite::long_histories_come_in_pieces_without_gaps,
     suite::other_processes_commits_are_heard,
     suite::several_writers_take_turns,

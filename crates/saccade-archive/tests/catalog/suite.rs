@@ -443,6 +443,38 @@ pub(crate) async fn sections_are_those_with_tiles(place: &Place) {
     assert_eq!(catalog.section_tiles("v", 5).await.unwrap().len(), 3);
 }
 
+pub(crate) async fn channels_have_the_sections_of_their_tiles(place: &Place) {
+    let catalog = place.catalog().await;
+    let of = async |channels, within| {
+        let sections = catalog.sections_of_channels("v", channels, within);
+        sections.await.unwrap()
+    };
+    let all = || 0..u32::MAX;
+    let none: Vec<u32> = Vec::new();
+    assert_eq!(of(2, all()).await, [none.clone(), none.clone()]);
+    for (n, (section, channel)) in (0..).zip([(5, 0), (0, 0), (3, 1), (3, 1), (0, 1), (5, 2)]) {
+        let new = NewTile {
+            channel,
+            ..tile(&format!("t{n}"), section, at(0.0, 0.0), 1)
+        };
+        catalog.commit_tile("v", &new).await.unwrap();
+    }
+    assert_eq!(of(3, all()).await, [vec![0, 5], vec![0, 3], vec![5]]);
+    assert_eq!(of(4, 1..5).await, [vec![], vec![3], vec![], vec![]]);
+    assert_eq!(of(1, 1..6).await, [[3, 5]], "of one, each section counts");
+    assert_eq!(of(2, 5..3).await, [none.clone(), none.clone()]);
+    // One that is left in a section counts; one that has another channel now, or is gone, does not.
+    catalog.delete_tile("v", "t2", 2).await.unwrap();
+    catalog.delete_tile("v", "t0", 2).await.unwrap();
+    let again = NewTile {
+        channel: 2,
+        ..tile("t4", 0, at(0.0, 0.0), 2)
+    };
+    catalog.commit_tile("v", &again).await.unwrap();
+    assert_eq!(of(3, all()).await, [vec![0], vec![3], vec![0, 5]]);
+    assert!(catalog.sections_of_channels("w", 2, all()).await.is_err());
+}
+
 pub(crate) async fn long_histories_come_in_pieces_without_gaps(place: &Place) {
     let catalog = place.catalog().await;
     let mut commit = catalog.begin("v").await.unwrap();
