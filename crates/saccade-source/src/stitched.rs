@@ -119,7 +119,7 @@ pub struct StitchedOptions {
     pub overlaps: Overlaps,
     /// What a voxel is that spans several sections.
     pub along_z: AlongZ,
-    /// What is shown in place of sections that have no tile.
+    /// What is shown in place of sections that have no tile of a channel.
     pub gaps: Gaps,
     /// Keeps finished blocks and coarsest levels of pyramids over restarts. For archives that can be written, which then get an object
     /// `identity` that tells them from others.
@@ -205,6 +205,9 @@ struct Inner {
     changes: Arc<Changes>,
     counted: Mutex<Counted>,
     runtime: Handle,
+    /// What it is to leave out, so that a test finds that.
+    #[cfg(test)]
+    wrong: std::sync::OnceLock<tests::Wrong>,
 }
 
 impl Drop for StitchedSource {
@@ -276,6 +279,8 @@ impl StitchedSource {
             counted: Mutex::default(),
             runtime: Handle::current(),
             volume,
+            #[cfg(test)]
+            wrong: std::sync::OnceLock::new(),
         });
         let seen = Seen {
             revision: entry.revision,
@@ -346,11 +351,7 @@ impl VolumeSource for StitchedSource {
                 return Err(ChunkError::OutOfRange { id });
             }
             let (key, chunk) = self.inner.grid.block_of(id);
-            if !self
-                .inner
-                .builder
-                .may_have_data(self.inner.grid.voxels(key), key.level)
-            {
+            if !self.inner.builder.may_have_data(self.inner.place(key)) {
                 return Ok(Chunk::Empty);
             }
             let block = self.inner.block(key).await;

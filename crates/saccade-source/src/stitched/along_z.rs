@@ -1,16 +1,18 @@
 //! Which sections a voxel takes its samples from.
 
+use std::ops::Range;
+
 use saccade_core::levels::Level;
 
-use super::index::TileIndex;
+use super::index::{Acquired, TileIndex};
 use super::resample::Sample;
 use glam::DVec2;
 
 /// Of the sections that a voxel spans, all of these nearest ones are looked at; of those behind, ever
 /// fewer.
-const NEAR_SECTIONS: usize = 4;
+const NEAR_SECTIONS: u8 = 4;
 
-/// What is shown where sections between two others have no tile at all: lost, or still to come.
+/// What is shown where sections between two others have no tile of the channel at all: lost, left out, or still to come.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Gaps {
     /// Nothing.
@@ -65,24 +67,20 @@ impl Sections {
         first.iter().chain(then).copied()
     }
 
-    /// Of voxel `z` of a level: those it spans that have tiles, the one nearest its centre first, as
+    /// Of voxel `z` of a channel's level: those it spans that have tiles of the channel, the one nearest its centre first, as
     /// far as they are looked at; or those around it.
     pub(super) fn of(
         index: &TileIndex,
         (along_z, gaps): (AlongZ, Gaps),
-        level: Level,
+        (channel, level): (u32, Level),
         z: u32,
     ) -> Self {
-        let span = level.downsampling.z;
-        let z = f64::from(z);
-        // Those whose middle lies within the voxel.
-        let first = |z: f64| DVec2::splat((z * span - 0.5).ceil().max(0.0)).as_uvec2().x;
-        let range = first(z)..first(z + 1.0);
-        let centre = (z + 0.5) * span;
+        let range = sections_within(level, z);
+        let centre = (f64::from(z) + 0.5) * level.downsampling.z;
         let offset = |section: &u32| f64::from(*section) + 0.5 - centre;
-        let mut sections = index.acquired(range.clone());
+        let mut sections = index.acquired(channel, range.clone());
         if sections.is_empty() && gaps != Gaps::Empty {
-            let (below, above) = index.around(range);
+            let (below, above) = index.around(channel, range);
             let gap = below
                 .zip(above)
                 .filter(|(a, b)| b - a - 1 <= gaps.longest());
@@ -101,7 +99,8 @@ impl Sections {
         // Stable: of two equally near ones, the first.
         sections.sort_by(|a, b| offset(a).abs().total_cmp(&offset(b).abs()));
         let ranked = (1_usize..).zip(sections);
-        let looked_at = ranked.filter(|(rank, _)| *rank <= NEAR_SECTIONS || rank.is_power_of_two());
+        let looked_at = ranked
+            .filter(|(rank, _)| *rank <= usize::from(NEAR_SECTIONS) || rank.is_power_of_two());
         let sections: Vec<u32> = looked_at.map(|(_, section)| section).collect();
         if along_z == AlongZ::Linear && { sections.iter() }.all(|section| offset(section) != 0.0) {
             let side =
@@ -113,6 +112,118 @@ impl Sections {
             }
         }
         Self::FirstOf(sections)
+    }
+}
+
+/// Those whose middle lies within voxel `z` of a level.
+fn sections_within(level: Level, z: u32) -> Range<u32> {
+    let span = level.downsampling.z;
+    let first = |z: f64| DVec2::splat((z * span - 0.5).ceil().max(0.0)).as_uvec2().x;
+    first(z.into())..first(f64::from(z) + 1.0)
+}
+
+/// Where a section of a volume is seen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Reach {
+    /// Planes of level 0 whose voxels, or those around them of coarser levels, look at it.
+    pub(super) sections: Range<u32>,
+    /// Whether they may be others everywhere, not only where its tiles lie, because of whether it has any.
+    pub(super) everywhere: bool,
+}
+
+impl Reach {
+    /// In its own plane, where its tiles lie.
+    pub(super) fn own(section: u32) -> Self {
+        Self {
+            sections: section..section.saturating_add(1),
+            everywhere: false,
+        }
+    }
+
+    /// What both are.
+    pub(super) fn union(self, other: Self) -> Self {
+        let (a, b) = (self.sections, other.sections);
+        Self {
+            sections: a.start.min(b.start)..a.end.max(b.end),
+            everywhere: self.everywhere || other.everywhere,
+        }
+    }
+}
+
+/// Says where sections are seen, in the words of [`Sections::of`].
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Reaches<'v> {
+    pub(super) along_z: AlongZ,
+    pub(super) gaps: Gaps,
+    pub(super) levels: &'v [Level],
+}
+
+impl Reaches<'_> {
+    /// Of a section in a channel, as long as these sections have tiles; `turned` if it had none before, or has none afterwards.
+    pub(super) fn of(
+        &self,
+        acquired: &Acquired,
+        channel: u32,
+        section: u32,
+        turned: bool,
+    ) -> Reach {
+        let mut reach = Reach::own(section);
+        let own = reach.sections.clone();
+        let (below, above) = acquired.around(channel, own);
+        let is_filled = |a: u32, b: u32| (1..=self.gaps.longest()).contains(&(b - a - 1));
+        let mut filled = false;
+        if acquired.has(channel, section) {
+            let halves = matches!(self.gaps, Gaps::Nearest(_)) && !turned;
+            if let Some(below) = below.filter(|below| is_filled(*below, section)) {
+                let to = if halves {
+                    below.midpoint(section)
+                } else {
+                    below
+                };
+                (reach.sections.start, filled) = (to + 1, true);
+            }
+            if let Some(above) = above.filter(|above| is_filled(section, *above)) {
+                let half = || section.midpoint(above) + 1;
+                (reach.sections.end, filled) = (if halves { half() } else { above }, true);
+            }
+        } else if let Some((below, above)) = below.zip(above)
+            && is_filled(below, above)
+        {
+            (reach.sections, filled) = (below + 1..above, true);
+        }
+        reach.everywhere = turned && (filled || self.ranks_count(acquired, channel, section));
+        reach
+    }
+
+    /// Of a section at some time, whatever others had tiles then; `turned` if it may have had its first, or lost its last.
+    pub(super) fn at_some_time(&self, section: u32, turned: bool, depth: u32) -> Reach {
+        let longest = self.gaps.longest();
+        let own = Reach::own(section).sections;
+        let most = { self.levels.iter() }.map(|level| level.downsampling.z.min(depth.into()));
+        let ranked = most.fold(0.0, f64::max) > f64::from(self.unranked());
+        Reach {
+            sections: own.start.saturating_sub(longest)..own.end.saturating_add(longest),
+            everywhere: turned && (longest > 0 || ranked),
+        }
+    }
+
+    /// Of so few sections that a voxel spans, none hides by its rank that another is looked at, or changes what share it has.
+    fn unranked(&self) -> u8 {
+        match self.along_z {
+            AlongZ::Nearest => NEAR_SECTIONS,
+            AlongZ::Linear => 2,
+        }
+    }
+
+    /// Whether a voxel that spans a section shows other sections otherwise where it has no tile, by whether it has any elsewhere.
+    fn ranks_count(&self, acquired: &Acquired, channel: u32, section: u32) -> bool {
+        self.levels.iter().any(|level| {
+            let middle = (f64::from(section) + 0.5) / level.downsampling.z;
+            let z = DVec2::splat(middle).as_uvec2().x;
+            let others = acquired.within(channel, sections_within(*level, z));
+            let others = others.filter(|other| *other != section);
+            others.take(self.unranked().into()).count() == usize::from(self.unranked())
+        })
     }
 }
 

@@ -153,11 +153,7 @@ impl Inner {
                 Some(permit) => permit,
                 None => turn.await,
             };
-            let place = Place {
-                channel: key.channel,
-                level: key.level,
-                voxels: inner.grid.voxels(key),
-            };
+            let place = inner.place(key);
             let built = inner.kept_or_built(place).await;
             drop(permit);
             let block = Arc::new(built.map_err(Arc::new)?);
@@ -172,6 +168,14 @@ impl Inner {
         building.boxed().shared()
     }
 
+    pub(super) fn place(&self, key: BlockKey) -> Place {
+        Place {
+            channel: key.channel,
+            level: key.level,
+            voxels: self.grid.voxels(key),
+        }
+    }
+
     /// A block from the cache on disk, or built now.
     async fn kept_or_built(&self, place: Place) -> Result<Block, StitchError> {
         let spans = self.volume.levels[place.level as usize].downsampling.z;
@@ -180,6 +184,11 @@ impl Inner {
         };
         let plan = self.builder.plan(place).await?;
         let description = self.builder.description(place, &plan);
+        #[cfg(test)]
+        let description = match self.wrong.get() {
+            Some(super::tests::Wrong::Disk) => format!("{place:?}"),
+            _ => description,
+        };
         let description = [identity, description.as_bytes()].concat();
         let kept = disk.get(&description).await;
         if let Some(block) = kept.and_then(|bytes| Block::from_bytes(&bytes)) {
@@ -195,6 +204,10 @@ impl Inner {
 
     /// Forgets all that shows level-0 voxels of a box.
     pub(super) fn forget(&self, voxels: VoxelBox) {
+        #[cfg(test)]
+        if self.wrong.get() == Some(&super::tests::Wrong::Blocks) {
+            return;
+        }
         self.blocks.forget(|key| self.grid.touches(key, voxels));
     }
 }

@@ -14,7 +14,7 @@ use saccade_core::levels::Level;
 use saccade_core::volume::{Dtype, Volume, VoxelKind};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::along_z::{AlongZ, Gaps, Sections, between};
+use super::along_z::{AlongZ, Gaps, Reach, Reaches, Sections, between};
 use super::block::{Block, BlockGrid, Failure, Slice};
 use super::canvas::Canvas;
 use super::coverage::{Candidate, Grid, Overlaps, Segment, Uncovered};
@@ -149,27 +149,32 @@ impl Builder {
         }
     }
 
-    /// Whether a box of a level's voxels touches a section that has a tile, or one that shows such.
-    pub(super) fn may_have_data(&self, voxels: VoxelBox, level: u32) -> bool {
-        let level0 = self.volume.levels[level as usize].voxels_from_box(voxels);
+    /// Whether voxels touch a section that has a tile of their channel, or one that shows such.
+    pub(super) fn may_have_data(&self, place: Place) -> bool {
+        let level0 = self.level(place).voxels_from_box(place.voxels);
         let reach = self.rules.gaps.longest();
         let first = level0.min.z.saturating_sub(reach);
         let end = level0.max.z.saturating_add(reach);
-        self.tiles.index().any_acquired(first..end)
+        self.tiles.index().any_acquired(place.channel, first..end)
     }
 
-    /// The level-0 voxels that may be others when those of a box of one section are; `all` of its
-    /// sections if it has its first tile, or lost its last.
-    pub(super) fn touched(&self, mut voxels: VoxelBox, all: bool) -> VoxelBox {
-        let reach = self.rules.gaps.longest();
+    /// What says where changes are seen.
+    pub(super) fn reaches(&self) -> Reaches<'_> {
+        Reaches {
+            along_z: self.rules.along_z,
+            gaps: self.rules.gaps,
+            levels: &self.volume.levels,
+        }
+    }
+
+    /// The level-0 voxels that may be others when those of a box of one section are.
+    pub(super) fn touched(&self, mut voxels: VoxelBox, reach: &Reach) -> VoxelBox {
         let extent = self.volume.extent();
-        if reach > 0 {
-            voxels.min.z = voxels.min.z.saturating_sub(reach);
-            voxels.max.z = voxels.max.z.saturating_add(reach).min(extent.z);
-            if all {
-                voxels.min = voxels.min.with_x(0).with_y(0);
-                voxels.max = voxels.max.with_x(extent.x).with_y(extent.y);
-            }
+        voxels.min.z = reach.sections.start;
+        voxels.max.z = reach.sections.end.min(extent.z);
+        if reach.everywhere {
+            voxels.min = voxels.min.with_x(0).with_y(0);
+            voxels.max = voxels.max.with_x(extent.x).with_y(extent.y);
         }
         voxels
     }
@@ -235,7 +240,12 @@ impl Builder {
             return sections.clone();
         }
         let rules = (self.rules.along_z, self.rules.gaps);
-        Sections::of(self.tiles.index(), rules, self.level(place), z)
+        Sections::of(
+            self.tiles.index(),
+            rules,
+            (place.channel, self.level(place)),
+            z,
+        )
     }
 
     /// Bounds of the values in a box: of the sub-tiles below it, none of which is read. `None` where

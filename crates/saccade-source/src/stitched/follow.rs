@@ -8,6 +8,8 @@ use saccade_core::voxel_box::VoxelBox;
 use tokio::sync::watch;
 
 use super::Inner;
+#[cfg(test)]
+use super::along_z::Reach;
 use crate::Change;
 
 /// When the catalog cannot be read, it is tried again after this.
@@ -106,17 +108,23 @@ async fn catch_up(
         };
         // First what is known, then what was built of it, then the news: whoever reads after the
         // news gets neither.
-        let turned = inner.builder.tiles().index().apply(&changes).await;
+        let (index, reaches) = (inner.builder.tiles().index(), inner.builder.reaches());
+        let reached = index.apply(&changes, &reaches).await?;
+        #[cfg(test)]
+        let reached = match inner.wrong.get() {
+            Some(super::tests::Wrong::Filled) => changes
+                .iter()
+                .map(|change| Reach::own(change.section))
+                .collect(),
+            _ => reached,
+        };
         let changed = |section| changes.iter().any(|change| change.section == section);
         inner.builder.tiles().damaged().forget(changed);
         let ahead = inner.counted().ahead;
-        let told = changes.iter().map(|change| {
-            let all = turned.contains(&change.section);
-            Change {
-                revision: change.revision + ahead,
-                voxels: inner.builder.touched(change.voxels, all),
-                reason: reason(change.reason),
-            }
+        let told = changes.iter().zip(&reached).map(|(change, reach)| Change {
+            revision: change.revision + ahead,
+            voxels: inner.builder.touched(change.voxels, reach),
+            reason: reason(change.reason),
         });
         for change in merged(told.collect()) {
             inner.forget(change.voxels);
@@ -143,11 +151,17 @@ impl Inner {
                     return Ok(catalog.revision(name).await? == revision);
                 };
                 revision = last.revision;
-                // Which sections had their first tile or lost their last is not kept: each may have.
-                all.extend(changes.iter().map(|change| Change {
-                    revision: change.revision + ahead,
-                    voxels: self.builder.touched(change.voxels, true),
-                    reason: reason(change.reason),
+                all.extend(changes.iter().map(|change| {
+                    // Which sections had their first tile of a channel or lost their last is not kept: each may have.
+                    let turned = change.reason != ChangeReason::Transform;
+                    let depth = self.volume.extent().z;
+                    let reaches = self.builder.reaches();
+                    let reach = reaches.at_some_time(change.section, turned, depth);
+                    Change {
+                        revision: change.revision + ahead,
+                        voxels: self.builder.touched(change.voxels, &reach),
+                        reason: reason(change.reason),
+                    }
                 }));
             }
         };

@@ -1,5 +1,6 @@
 //! Which tiles lie where.
 
+mod acquired;
 mod section;
 #[cfg(test)]
 mod tests;
@@ -10,11 +11,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use saccade_archive::catalog::{Catalog, CatalogChange, CatalogError, TileId};
+use saccade_archive::catalog::{Catalog, CatalogChange, CatalogError, ChangeReason, Tile, TileId};
 use tokio::sync::OnceCell;
 
+use super::along_z::{Reach, Reaches};
+pub(super) use acquired::Acquired;
 pub use section::{SectionIndex, TileUpdate};
 pub(super) use tile::IndexedTile;
+
+/// Any section that can be.
+const ALL_SECTIONS: Range<u32> = 0..u32::MAX;
 
 type Cell = Arc<OnceCell<Arc<SectionIndex>>>;
 
@@ -89,20 +95,20 @@ impl Sections {
 
 /// Where the tiles of a volume lie \[000 §5.1\].
 ///
-/// Knows from the start which sections have tiles, and loads a section's when it is first asked for.
+/// Knows from the start which sections have tiles, and of which channels, and loads a section's when it is first asked for.
 /// From then on [`Self::apply`] keeps it as the catalog has it, until others need its memory.
 pub struct TileIndex {
     catalog: Catalog,
     volume: Box<str>,
-    /// Sections that have a tile.
-    acquired: Mutex<BTreeSet<u32>>,
+    channels: u32,
+    acquired: Mutex<Acquired>,
     sections: Mutex<Sections>,
     /// Memory for sections \[bytes\].
     most_bytes: u64,
 }
 
 impl TileIndex {
-    /// Of a volume. Reads which sections have tiles, and nothing of the tiles. Keeps sections of at most
+    /// Of a volume. Reads which sections have tiles of which channels, and nothing else of the tiles. Keeps sections of at most
     /// `most_bytes`, one at least.
     ///
     /// # Errors
@@ -113,11 +119,14 @@ impl TileIndex {
         volume: &str,
         most_bytes: u64,
     ) -> Result<Self, CatalogError> {
-        let acquired = catalog.sections(volume).await?;
+        let channels = catalog.entry(volume).await?.volume.channels.len();
+        let channels = u32::try_from(channels).unwrap_or(u32::MAX);
+        let acquired = { catalog.sections_of_channels(volume, channels, ALL_SECTIONS) }.await?;
         Ok(Self {
             catalog: catalog.clone(),
             volume: volume.into(),
-            acquired: Mutex::new(acquired.into_iter().collect()),
+            channels,
+            acquired: Mutex::new(Acquired::new(acquired)),
             sections: Mutex::default(),
             most_bytes,
         })
@@ -128,22 +137,19 @@ impl TileIndex {
         &self.catalog
     }
 
-    /// The sections in a range that have a tile, ascending.
-    pub fn acquired(&self, sections: Range<u32>) -> Vec<u32> {
-        lock(&self.acquired).range(sections).copied().collect()
+    /// The sections in a range that have a tile of a channel, ascending.
+    pub fn acquired(&self, channel: u32, sections: Range<u32>) -> Vec<u32> {
+        lock(&self.acquired).within(channel, sections).collect()
     }
 
-    /// The nearest sections with tiles below and above a range.
-    pub(super) fn around(&self, sections: Range<u32>) -> (Option<u32>, Option<u32>) {
-        let acquired = lock(&self.acquired);
-        let below = acquired.range(..sections.start).next_back();
-        let above = acquired.range(sections.end.max(sections.start)..).next();
-        (below.copied(), above.copied())
+    /// The nearest sections with tiles of a channel below and above a range.
+    pub(super) fn around(&self, channel: u32, sections: Range<u32>) -> (Option<u32>, Option<u32>) {
+        lock(&self.acquired).around(channel, sections)
     }
 
-    /// Whether a section in a range has a tile.
-    pub fn any_acquired(&self, sections: Range<u32>) -> bool {
-        !sections.is_empty() && lock(&self.acquired).range(sections).next().is_some()
+    /// Whether a section in a range has a tile of a channel.
+    pub fn any_acquired(&self, channel: u32, sections: Range<u32>) -> bool {
+        { lock(&self.acquired).within(channel, sections).next() }.is_some()
     }
 
     /// The tiles of a section, loaded on first touch.
@@ -163,17 +169,20 @@ impl TileIndex {
         index
     }
 
-    /// Follows the catalog: what is asked for after this shows these changes. Returns the sections that
-    /// had no tile before, and those that have none any more.
+    /// Follows the catalog: what is asked for after this shows these changes. Returns where each is seen.
     ///
     /// Reads the tiles that changed. Where that fails, their sections are forgotten, to be loaded when
     /// they are asked for.
-    pub async fn apply(&self, changes: &[CatalogChange]) -> BTreeSet<u32> {
-        let mut turned: BTreeSet<u32> = changes.iter().map(|change| change.section).collect();
-        {
-            let mut acquired = lock(&self.acquired);
-            turned.retain(|section| acquired.insert(*section));
-        }
+    ///
+    /// # Errors
+    ///
+    /// What the database says where it does not tell which channels the sections have; to be told these changes
+    /// once more then.
+    pub(super) async fn apply(
+        &self,
+        changes: &[CatalogChange],
+        reaches: &Reaches<'_>,
+    ) -> Result<Vec<Reach>, CatalogError> {
         let mut changed: BTreeMap<u32, BTreeSet<TileId>> = BTreeMap::new();
         for change in changes {
             changed
@@ -184,32 +193,84 @@ impl TileIndex {
         // Whoever begins to load a section from here on sees the changes.
         let loading = |z: u32, s: &Section| changed.contains_key(&z) && !s.cell.initialized();
         lock(&self.sections).retain(|z, section| !loading(z, section));
+        let forget = || lock(&self.sections).retain(|z, _| !changed.contains_key(&z));
+        let mut now = BTreeMap::new();
+        for &z in changed.keys() {
+            let within = z..z.saturating_add(1);
+            let of = self
+                .catalog
+                .sections_of_channels(&self.volume, self.channels, within);
+            let of = of.await.inspect_err(|_| forget())?;
+            let has: Vec<bool> = of.iter().map(|sections| !sections.is_empty()).collect();
+            now.insert(z, has);
+        }
         let ids: BTreeSet<TileId> = changed.values().flatten().copied().collect();
         let ids: Vec<_> = ids.into_iter().collect();
         let tiles = match self.catalog.tiles(&self.volume, &ids).await {
-            Ok(tiles) => tiles,
+            Ok(tiles) => Some(tiles),
             Err(error) => {
                 log::warn!("changed tiles cannot be read, their sections are forgotten: {error}");
-                lock(&self.sections).retain(|z, _| !changed.contains_key(&z));
-                return turned;
+                forget();
+                None
             }
         };
-        let tiles: BTreeMap<_, _> = tiles.iter().map(|tile| (tile.id, tile)).collect();
-        for (z, ids) in changed {
-            let updates = ids.iter().map(|id| match tiles.get(id) {
-                Some(tile) if tile.section == z => TileUpdate::Put(tile),
-                // It lies in another section now, whose change says so.
-                _ => TileUpdate::Remove(*id),
-            });
-            let loses = { updates.clone() }.any(|update| matches!(update, TileUpdate::Remove(_)));
-            lock(&self.sections).replace(z, |old| old.updated(updates));
-            // Hardly ever: the microscope says that a tile is of another section than it said before.
-            if loses && self.section(z).await.is_ok_and(|index| index.tiles() == 0) {
-                lock(&self.acquired).remove(&z);
-                turned.insert(z);
+        let known: BTreeMap<_, _> = tiles.iter().flatten().map(|tile| (tile.id, tile)).collect();
+        let reached = self.turn(changes, &now, &known, reaches);
+        if tiles.is_some() {
+            for (z, ids) in changed {
+                let updates = ids.iter().map(|id| match known.get(id) {
+                    Some(tile) if tile.section == z => TileUpdate::Put(tile),
+                    // It lies in another section now, whose change says so.
+                    _ => TileUpdate::Remove(*id),
+                });
+                lock(&self.sections).replace(z, |old| old.updated(updates));
             }
         }
-        turned
+        Ok(reached)
+    }
+
+    /// Sections have tiles of these channels now. Returns where each change is seen, by what was and by what is.
+    fn turn(
+        &self,
+        changes: &[CatalogChange],
+        now: &BTreeMap<u32, Vec<bool>>,
+        tiles: &BTreeMap<TileId, &Tile>,
+        reaches: &Reaches<'_>,
+    ) -> Vec<Reach> {
+        let mut acquired = lock(&self.acquired);
+        let turned: BTreeMap<u32, Vec<u32>> = { now.iter() }
+            .map(|(z, has)| (*z, acquired.turned(*z, has)))
+            .collect();
+        let reach = |acquired: &Acquired, change: &CatalogChange| {
+            let turned = turned.get(&change.section).map_or(&[][..], Vec::as_slice);
+            // What moves keeps its channel. Of what else is new, that of the tile before is not known: it is one that the
+            // section had.
+            let own = { tiles.get(&change.tile) }
+                .filter(|_| change.reason == ChangeReason::Transform)
+                .map(|tile| tile.channel);
+            let may_be = |channel| match own {
+                Some(own) => own == channel,
+                None => acquired.has(channel, change.section),
+            };
+            let channels = acquired.channels();
+            channels.fold(Reach::own(change.section), |reach, channel| {
+                let turned = turned.contains(&channel);
+                if !turned && !may_be(channel) {
+                    return reach;
+                }
+                reach.union(reaches.of(acquired, channel, change.section, turned))
+            })
+        };
+        let before: Vec<Reach> = changes.iter().map(|c| reach(&acquired, c)).collect();
+        for (z, channels) in &turned {
+            acquired.turn(*z, channels);
+        }
+        let after = changes.iter().map(|c| reach(&acquired, c));
+        before
+            .into_iter()
+            .zip(after)
+            .map(|(a, b)| a.union(b))
+            .collect()
     }
 
     /// Forgets all it knows, where it cannot be told what changed.
@@ -219,8 +280,9 @@ impl TileIndex {
     /// What the database says; it knows then what it knew before.
     pub async fn reload(&self) -> Result<(), CatalogError> {
         // Whoever begins to load a section after these were read sees what is in the catalog now.
-        let acquired = self.catalog.sections(&self.volume).await?;
-        *lock(&self.acquired) = acquired.into_iter().collect();
+        let acquired =
+            { &self.catalog }.sections_of_channels(&self.volume, self.channels, ALL_SECTIONS);
+        *lock(&self.acquired) = Acquired::new(acquired.await?);
         lock(&self.sections).retain(|_, _| false);
         Ok(())
     }
@@ -236,7 +298,7 @@ impl TileIndex {
     pub fn bytes(&self) -> u64 {
         // Entries of the two trees, which are at least half full.
         let each = size_of::<(u32, Section)>() + size_of::<OnceCell<Arc<SectionIndex>>>() / 2;
-        let acquired = 2 * lock(&self.acquired).len() * size_of::<u32>();
+        let acquired = lock(&self.acquired).bytes();
         let sections = lock(&self.sections);
         let entries = 2 * sections.by_number.len() * each;
         (size_of::<Self>() + entries + acquired) as u64 + sections.bytes

@@ -21,6 +21,7 @@ use proptest::prelude::*;
 use super::StitchedOptions;
 use crate::conformance::check_reading;
 use crate::{Chunk, ChunkId, SourceError, VolumeSource};
+pub(super) use changes::Wrong;
 pub(super) use fixture::noise;
 use fixture::{Fixture, chunk_of, difference, expected, numbers, read_all, tile};
 

@@ -2,11 +2,20 @@ use std::collections::BTreeMap;
 
 use glam::{DVec2, DVec3, UVec2, UVec3};
 use proptest::prelude::*;
+use proptest::test_runner::{Config, TestError, TestRng, TestRunner};
 use saccade_archive::catalog::{Catalog, NewTile, Tile, TileId};
 use saccade_core::transform::{SectionFromTile, SectionPoint};
 use saccade_core::volume::Volume;
 
 use super::{SectionIndex, TileIndex, TileUpdate};
+use crate::stitched::along_z::{AlongZ, Gaps, Reaches};
+
+/// Where nothing is filled and no level is coarse.
+const OWN: Reaches<'_> = Reaches {
+    along_z: AlongZ::Nearest,
+    gaps: Gaps::Empty,
+    levels: &[],
+};
 
 fn tile(n: u32, size: UVec2, turn: f64, corner: DVec2) -> Tile {
     Tile {
@@ -106,42 +115,119 @@ proptest! {
         steps in steps(),
         rectangles in rectangles(),
     ) {
-        let first: Vec<_> = (0..).zip(places).map(|(n, place)| placed(n, place)).collect();
-        let mut index = SectionIndex::new(&first);
-        let mut tiles: BTreeMap<_, _> = first.into_iter().map(|tile| (tile.id, tile)).collect();
-        let mut revision = 1;
-        for batch in steps {
-            let before = (index.clone(), tiles.clone());
-            let mut news = Vec::new();
-            for step in batch {
-                revision += 1;
-                match step {
-                    Step::Put(n, place) => {
-                        let tile = Tile { revision, ..placed(n, place) };
-                        tiles.insert(tile.id, tile.clone());
-                        news.push(Ok(tile));
-                    }
-                    Step::Late(n, place) => {
-                        let tile = Tile { revision: 0, ..placed(n, place) };
-                        if tiles.contains_key(&tile.id) {
-                            news.push(Ok(tile));
-                        }
-                    }
-                    Step::Remove(n) => {
-                        tiles.remove(&TileId(n.into()));
-                        news.push(Err(TileId(n.into())));
+        update(Wrong::Nothing, places, steps, &rectangles)?;
+    }
+}
+
+/// What a wrong index does not hear of.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Wrong {
+    Nothing,
+    /// A tile of a batch is taken away.
+    Removal,
+    /// A tile of a batch comes.
+    New,
+    /// A tile of a batch is another than it was.
+    Changed,
+    /// It holds what is old for new.
+    Late,
+}
+
+fn update(
+    wrong: Wrong,
+    places: Vec<Place>,
+    steps: Vec<Vec<Step>>,
+    rectangles: &[(f64, f64, f64, f64)],
+) -> Result<(), TestCaseError> {
+    let first: Vec<_> = (0..)
+        .zip(places)
+        .map(|(n, place)| placed(n, place))
+        .collect();
+    let mut index = SectionIndex::new(&first);
+    let mut tiles: BTreeMap<_, _> = first.into_iter().map(|tile| (tile.id, tile)).collect();
+    let mut revision = 1;
+    for batch in steps {
+        let before = (index.clone(), tiles.clone());
+        let mut news = Vec::new();
+        let mut unheard = None;
+        for step in batch {
+            revision += 1;
+            let kind = match step {
+                Step::Put(n, place) => {
+                    let tile = Tile {
+                        revision,
+                        ..placed(n, place)
+                    };
+                    let known = tiles.insert(tile.id, tile.clone());
+                    news.push(Ok(tile));
+                    match known {
+                        None => Wrong::New,
+                        Some(_) => Wrong::Changed,
                     }
                 }
+                Step::Late(n, place) => {
+                    let revision = match wrong {
+                        Wrong::Late => revision,
+                        _ => 0,
+                    };
+                    let tile = Tile {
+                        revision,
+                        ..placed(n, place)
+                    };
+                    if !tiles.contains_key(&tile.id) {
+                        continue;
+                    }
+                    news.push(Ok(tile));
+                    Wrong::Nothing
+                }
+                Step::Remove(n) => {
+                    let known = tiles.remove(&TileId(n.into()));
+                    news.push(Err(TileId(n.into())));
+                    match known {
+                        None => Wrong::Nothing,
+                        Some(_) => Wrong::Removal,
+                    }
+                }
+            };
+            if kind == wrong && wrong != Wrong::Nothing {
+                unheard = Some(news.len() - 1);
             }
-            let updates = news.iter().map(|news| match news {
-                Ok(tile) => TileUpdate::Put(tile),
-                Err(id) => TileUpdate::Remove(*id),
-            });
-            index = index.updated(updates);
-            same(&index, &tiles, &rectangles)?;
-            same(&before.0, &before.1, &rectangles)?;
-            prop_assert!(index.hidden.len() + index.recent.len() <= index.most_changes());
         }
+        if let Some(unheard) = unheard {
+            drop(news.remove(unheard));
+        }
+        let updates = news.iter().map(|news| match news {
+            Ok(tile) => TileUpdate::Put(tile),
+            Err(id) => TileUpdate::Remove(*id),
+        });
+        index = index.updated(updates);
+        same(&index, &tiles, rectangles)?;
+        same(&before.0, &before.1, rectangles)?;
+        prop_assert!(index.hidden.len() + index.recent.len() <= index.most_changes());
+    }
+    Ok(())
+}
+
+/// Negative controls: of news that an index does not hear of, or takes for new, the comparison tells.
+#[test]
+fn what_is_not_updated_is_found() {
+    for wrong in [Wrong::Removal, Wrong::New, Wrong::Changed, Wrong::Late] {
+        let config = Config {
+            max_shrink_iters: 0,
+            failure_persistence: None,
+            ..Config::default()
+        };
+        let rng = TestRng::deterministic_rng(config.rng_algorithm);
+        let mut runner = TestRunner::new_with_rng(config, rng);
+        let cases = (
+            prop::collection::vec(place(), 0..300),
+            steps(),
+            rectangles(),
+        );
+        let found = runner.run(&cases, |(places, steps, rectangles)| {
+            update(wrong, places, steps, &rectangles)
+        });
+        assert!(matches!(found, Err(TestError::Fail(..))), "{wrong:?}");
     }
 }
 
@@ -177,10 +263,16 @@ fn one_tile_far_out_costs_nothing() {
 
 /// A catalog, and a name of a volume in it.
 async fn catalog(folder: &tempfile::TempDir) -> Catalog {
+    with_channels(folder, &["intensity"]).await
+}
+
+async fn with_channels(folder: &tempfile::TempDir, channels: &[&str]) -> Catalog {
     let catalog = Catalog::create(&folder.path().join("catalog.sqlite"))
         .await
         .unwrap();
-    let volume = Volume::new("v", UVec3::new(2000, 2000, 9), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+    let mut volume =
+        Volume::new("v", UVec3::new(2000, 2000, 9), DVec3::new(4.0, 4.0, 40.0)).unwrap();
+    volume.channels = channels.iter().map(|name| (*name).into()).collect();
     catalog.create_volume(&volume).await.unwrap();
     catalog
 }
@@ -230,9 +322,9 @@ async fn follows_the_catalog() {
         catalog.commit_tile("v", &tile).await.unwrap();
     }
     let index = TileIndex::open(&catalog, "v", u64::MAX).await.unwrap();
-    assert_eq!(index.acquired(0..9), [0, 1, 2]);
+    assert_eq!(index.acquired(0, 0..9), [0, 1, 2]);
     assert_eq!(
-        (index.tiles(), index.any_acquired(3..9)),
+        (index.tiles(), index.any_acquired(0, 3..9)),
         (0, false),
         "nothing is loaded"
     );
@@ -284,17 +376,101 @@ async fn follows_the_catalog() {
         }
         let changes = catalog.changes_after("v", seen).await.unwrap();
         assert!(!changes.is_empty(), "step {step} changes something");
-        index.apply(&changes).await;
+        index.apply(&changes, &OWN).await.unwrap();
         seen = changes[changes.len() - 1].revision;
         compare(&index, &catalog).await;
     }
     assert_eq!(
-        index.acquired(0..9),
+        index.acquired(0, 0..9),
         [1, 2, 7, 8],
         "section 0 has lost its tiles"
     );
     assert_eq!(held.tiles(), 2, "whoever holds an index keeps it");
     assert!(index.bytes() > 200 * index.tiles(), "the tiles count");
+}
+
+/// Which sections have tiles of a channel follows tiles that come, change their channel or section, and go; and where each
+/// change is seen is told: no more of the gaps around it than it fills, of what only moves those of its channel.
+#[tokio::test]
+async fn sections_count_by_channel() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = with_channels(&folder, &["a", "b", "c"]).await;
+    let new = |name: &str, section, channel, position| NewTile {
+        channel,
+        ..new_tile(name, section, 20.0, position)
+    };
+    for section in 0..9 {
+        let tile = new(&format!("a{section}"), section, 0, 1);
+        catalog.commit_tile("v", &tile).await.unwrap();
+    }
+    for section in [0, 3] {
+        let tile = new(&format!("b{section}"), section, 1, 1);
+        catalog.commit_tile("v", &tile).await.unwrap();
+    }
+    let index = TileIndex::open(&catalog, "v", u64::MAX).await.unwrap();
+    let reaches = Reaches {
+        gaps: Gaps::Nearest(3),
+        ..OWN
+    };
+    let of = |index: &TileIndex| [0, 1, 2].map(|channel| index.acquired(channel, 0..9));
+    let every: Vec<u32> = (0..9).collect();
+    assert_eq!(of(&index), [every.clone(), vec![0, 3], vec![]]);
+    let moved = SectionFromTile::translation(DVec2::splat(700.0));
+    let mut seen = catalog.revision("v").await.unwrap();
+    for step in 0..8 {
+        let (b, c, reached) = match step {
+            // A gap of two is filled on both sides, one of four is not.
+            0 => {
+                let tile = new("b8", 8, 1, 2);
+                catalog.commit_tile("v", &tile).await.unwrap();
+                (vec![0, 3, 8], vec![], vec![(8..9, false)])
+            }
+            1 => {
+                let tile = new("b7", 7, 1, 3);
+                catalog.commit_tile("v", &tile).await.unwrap();
+                (vec![0, 3, 7, 8], vec![], vec![(4..8, true)])
+            }
+            // What moves is seen as far as its own channel is, nearer to it than to the next.
+            2 => {
+                catalog.set_transform("v", "b3", moved).await.unwrap();
+                (vec![0, 3, 7, 8], vec![], vec![(2..6, false); 2])
+            }
+            3 => {
+                catalog.set_transform("v", "a3", moved).await.unwrap();
+                (vec![0, 3, 7, 8], vec![], vec![(3..4, false); 2])
+            }
+            // Of another channel now; of another section.
+            4 => {
+                let tile = new("b3", 3, 2, 4);
+                catalog.commit_tile("v", &tile).await.unwrap();
+                (vec![0, 7, 8], vec![3], vec![(1..7, true); 2])
+            }
+            5 => {
+                let tile = new("b8", 4, 1, 5);
+                catalog.commit_tile("v", &tile).await.unwrap();
+                (vec![0, 4, 7], vec![3], vec![(8..9, false), (1..7, true)])
+            }
+            // Taken away, and its gap with it.
+            6 => {
+                catalog.delete_tile("v", "b8", 9).await.unwrap();
+                (vec![0, 7], vec![3], vec![(1..7, true)])
+            }
+            _ => {
+                catalog.delete_tile("v", "b3", 9).await.unwrap();
+                (vec![0, 7], vec![], vec![(3..4, false)])
+            }
+        };
+        let changes = catalog.changes_after("v", seen).await.unwrap();
+        let told = index.apply(&changes, &reaches).await.unwrap();
+        let told: Vec<_> = { told.into_iter() }
+            .map(|reach| (reach.sections, reach.everywhere))
+            .collect();
+        assert_eq!(told, reached, "step {step}");
+        seen = changes[changes.len() - 1].revision;
+        assert_eq!(of(&index), [every.clone(), b, c], "step {step}");
+        let fresh = TileIndex::open(&catalog, "v", u64::MAX).await.unwrap();
+        assert_eq!(of(&index), of(&fresh), "step {step}");
+    }
 }
 
 #[tokio::test]
@@ -313,7 +489,7 @@ async fn a_catalog_that_cannot_be_read_leaves_nothing_stale() {
         .unwrap();
     let changes = catalog.changes_after("v", 1).await.unwrap();
     catalog.close().await;
-    index.apply(&changes).await;
+    index.apply(&changes, &OWN).await.unwrap_err();
     assert!(
         index.section(4).await.is_err(),
         "asked again, not answered from before"
@@ -367,9 +543,8 @@ async fn memory_is_bounded_and_what_is_used_stays() {
     let moved = new_tile("t3", 3, 500.0, 100);
     let before = catalog.revision("v").await.unwrap();
     catalog.commit_tile("v", &moved).await.unwrap();
-    index
-        .apply(&catalog.changes_after("v", before).await.unwrap())
-        .await;
+    let changes = catalog.changes_after("v", before).await.unwrap();
+    index.apply(&changes, &OWN).await.unwrap();
     let near = index.section(3).await.unwrap().near(0, ALL.0.0, ALL.1.0);
     assert!(near[0].min.x > 400.0, "{near:?}");
 }

@@ -11,6 +11,7 @@ use futures::StreamExt;
 use futures::future::{BoxFuture, Either, FutureExt, select};
 use glam::{DVec3, UVec2, UVec3};
 use proptest::prelude::*;
+use proptest::test_runner::{Config, TestError, TestRng, TestRunner};
 use saccade_archive::catalog::{Tile, place as place_of};
 use saccade_archive::storage::{Entry, MemoryStorage, Storage, StorageError};
 use saccade_core::transform::SectionFromTile;
@@ -186,6 +187,58 @@ fn a_neighbour_changes_nothing_outside_of_its_box() {
     });
 }
 
+/// Of the sections that a coarse voxel spans the nearest count, wherever in them their tiles lie: one that comes may take the
+/// place of another, or of its share, where it has none itself.
+#[test]
+fn a_section_that_outranks_another_leaves_nothing_stale() {
+    run(async {
+        for (along_z, left, right) in [
+            (AlongZ::Nearest, &[1][..], &[4, 2, 5][..]),
+            (AlongZ::Linear, &[1, 6], &[]),
+        ] {
+            let extent = UVec3::new(8800, 64, 16);
+            let mut fixture = Fixture::new(extent, DVec3::splat(4.0)).await;
+            let at = |section, x| tile((64, 64), section, (x, 0.0), 0.0, 1.0, u64::from(section));
+            for section in left {
+                fixture
+                    .put(&format!("l{section}"), at(*section, 100.0))
+                    .await;
+            }
+            for section in right {
+                fixture
+                    .put(&format!("r{section}"), at(*section, 8000.0))
+                    .await;
+            }
+            let options = options_of((Overlaps::NearestCentre, along_z, Gaps::Empty));
+            let source = fixture.open_with(options.clone()).await;
+            assert_eq!(fixture.volume.levels[3].downsampling, DVec3::splat(8.0));
+            let coarse = ChunkId { level: 3, ..FIRST };
+            let before = source.read(coarse).await.unwrap();
+            let since = source.revision();
+            let mut changes = source.changes();
+            fixture.put("new", at(3, 8000.0)).await;
+            let plane = VoxelBox::new(UVec3::new(0, 0, 3), extent.with_z(4));
+            assert_eq!(changes.next().await.unwrap().voxels, plane);
+            let told = source.changes_after(since).await.unwrap();
+            assert_eq!(
+                told.iter().map(|told| told.voxels).collect::<Vec<_>>(),
+                [plane]
+            );
+            let after = source.read(coarse).await.unwrap();
+            let fresh = fixture.open_with(options).await;
+            assert_eq!(after, fresh.read(coarse).await.unwrap(), "{along_z:?}");
+            assert_ne!(
+                before, after,
+                "{along_z:?}: it is seen where it has no tile"
+            );
+            // Once it has one, others lie where they lie.
+            fixture.put("next", at(3, 7900.0)).await;
+            let next = changes.next().await.unwrap().voxels;
+            assert_eq!((next.min.x, next.max.x), (7900, 7964));
+        }
+    });
+}
+
 #[derive(Clone, Debug)]
 enum Step {
     Put(usize, u32, (f64, f64), f64, u64, (usize, usize), f64),
@@ -272,118 +325,198 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
     #[test]
     fn nothing_stale_remains(steps in steps(), rules in rules()) {
-        run(async {
-            let mut fixture = small(Arc::new(MemoryStorage::new())).await;
-            let folder = tempfile::tempdir().unwrap();
-            let mut options = cached(folder.path(), rules).await;
-            let mut source = fixture.open_with(options.clone()).await;
-            let mut changes = source.changes();
-            // Keeps nothing of what was built, and what it was built from as long as it may.
-            let keeping = StitchedOptions {
-                block_bytes: 0,
-                sub_tile_bytes: 0,
-                ..options_of(rules)
-            };
-            let keeping = fixture.open_with(keeping).await;
-            read_all(&keeping).await;
-            let mut kept_changes = keeping.changes();
-            let opened_at = keeping.revision();
-            let volume = fixture.volume.clone();
-            let ids: Vec<_> = (0..).zip(&volume.levels).flat_map(|(level, _)| {
-                let chunks = VoxelBox::of_size(volume.chunks(level as usize));
-                chunks.iter().map(move |chunk| ChunkId { channel: 0, level, chunk })
-            }).collect();
-            read_all(&source).await;
-            let mut changed = false;
-            for step in steps {
-                match step {
-                    Step::Put(n, z, at, turn, seed, size, by) => {
-                        let tile = tile(size, z, at, turn, by, seed);
-                        let size = UVec2::new(size.0 as u32, size.1 as u32);
-                        if !lies_in(&volume, z, size, tile.transform) {
-                            continue;
-                        }
-                        fixture.put(&format!("t{n}"), tile).await;
-                        changed = true;
+        run(after(steps, rules, None))?;
+    }
+}
+
+/// What a wrong source leaves out when something changes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(in crate::stitched) enum Wrong {
+    /// Keeps blocks that show what changed.
+    Blocks,
+    /// Keeps those that show it in the place of lost sections.
+    Filled,
+    /// Finds blocks on disk by their place alone.
+    Disk,
+}
+
+impl StitchedSource {
+    fn go_wrong(&self, wrong: Option<Wrong>) {
+        if let Some(wrong) = wrong {
+            self.inner.wrong.set(wrong).unwrap();
+        }
+    }
+}
+
+/// Negative controls: what a source leaves out is found by the test of the right one.
+#[test]
+fn what_stays_stale_is_found() {
+    let filling = (Overlaps::NearestCentre, AlongZ::Nearest, Gaps::Nearest(2));
+    for (wrong, rules) in [
+        (Wrong::Blocks, rules().boxed()),
+        (Wrong::Filled, Just(filling).boxed()),
+        (Wrong::Disk, rules().boxed()),
+    ] {
+        let config = Config {
+            cases: 32,
+            max_shrink_iters: 0,
+            failure_persistence: None,
+            ..Config::default()
+        };
+        let rng = TestRng::deterministic_rng(config.rng_algorithm);
+        let mut runner = TestRunner::new_with_rng(config, rng);
+        let found = runner.run(&(steps(), rules), |(steps, rules)| {
+            run(after(steps, rules, Some(wrong)))
+        });
+        match found {
+            Err(TestError::Fail(reason, _)) => {
+                assert!(
+                    reason.message().starts_with("stale voxels"),
+                    "{wrong:?}: {reason}"
+                );
+            }
+            other => panic!("{wrong:?}: {other:?}"),
+        }
+    }
+}
+
+/// Does all steps to sources that stitch by these rules, one of which may be a wrong one, and looks whether they are like new.
+async fn after(steps: Vec<Step>, rules: Rules, wrong: Option<Wrong>) -> Result<(), TestCaseError> {
+    let mut fixture = small(Arc::new(MemoryStorage::new())).await;
+    let folder = tempfile::tempdir().unwrap();
+    let mut options = cached(folder.path(), rules).await;
+    let mut source = fixture.open_with(options.clone()).await;
+    source.go_wrong(wrong);
+    let mut changes = source.changes();
+    // Keeps nothing of what was built, and what it was built from as long as it may.
+    let keeping = StitchedOptions {
+        block_bytes: 0,
+        sub_tile_bytes: 0,
+        ..options_of(rules)
+    };
+    let keeping = fixture.open_with(keeping).await;
+    read_all(&keeping).await;
+    let mut kept_changes = keeping.changes();
+    let opened_at = keeping.revision();
+    let volume = fixture.volume.clone();
+    let ids: Vec<_> = (0..)
+        .zip(&volume.levels)
+        .flat_map(|(level, _)| {
+            let chunks = VoxelBox::of_size(volume.chunks(level as usize));
+            chunks.iter().map(move |chunk| ChunkId {
+                channel: 0,
+                level,
+                chunk,
+            })
+        })
+        .collect();
+    read_all(&source).await;
+    let mut changed = false;
+    for step in steps {
+        match step {
+            Step::Put(n, z, at, turn, seed, size, by) => {
+                let tile = tile(size, z, at, turn, by, seed);
+                let size = UVec2::new(size.0 as u32, size.1 as u32);
+                if !lies_in(&volume, z, size, tile.transform) {
+                    continue;
+                }
+                fixture.put(&format!("t{n}"), tile).await;
+                changed = true;
+            }
+            Step::Move(n, at, turn, by) => {
+                let name = format!("t{n}");
+                let catalog = fixture.archive.catalog();
+                if let Some(there) = catalog.tile("v", &name).await.unwrap() {
+                    let to = tile((80, 130), 0, at, turn, by, 0).transform;
+                    if !lies_in(&volume, there.section, there.size, to) {
+                        continue;
                     }
-                    Step::Move(n, at, turn, by) => {
-                        let name = format!("t{n}");
-                        let catalog = fixture.archive.catalog();
-                        if let Some(there) = catalog.tile("v", &name).await.unwrap() {
-                            let to = tile((80, 130), 0, at, turn, by, 0).transform;
-                            if !lies_in(&volume, there.section, there.size, to) {
-                                continue;
-                            }
-                            fixture.transform(&name, to).await;
-                            changed = true;
-                        }
-                    }
-                    Step::Shift(z, by) => {
-                        let catalog = fixture.archive.catalog();
-                        let tiles = catalog.section_tiles("v", z).await.unwrap();
-                        let stays = |tile: &Tile| {
-                            let to = tile.transform.shifted(by.into()).elements();
-                            lies_in(&volume, z, tile.size, to)
-                        };
-                        if tiles.iter().all(stays) {
-                            changed |= !tiles.is_empty();
-                            fixture.shift(z, by).await;
-                        }
-                    }
-                    Step::Delete(n) => changed |= fixture.delete(&format!("t{n}")).await,
-                    Step::Reopen => {
-                        drop((source, changes));
-                        options.disk_cache.take().unwrap().close().await;
-                        options = cached(folder.path(), rules).await;
-                        source = fixture.open_with(options.clone()).await;
-                        (changes, changed) = (source.changes(), false);
-                    }
-                    Step::Read(n) => drop(source.read(ids[n % ids.len()]).await.unwrap()),
-                    Step::Drop(n) => drop(source.read(ids[n % ids.len()]).now_or_never()),
+                    fixture.transform(&name, to).await;
+                    changed = true;
                 }
             }
-            if changed {
-                caught_up(&fixture, &mut changes).await;
-            }
-            let newest = fixture.archive.catalog().revision("v").await.unwrap();
-            // By what is told, not by the number beside it, which may be a moment behind or ahead.
-            if newest > opened_at {
-                while kept_changes.next().await.unwrap().revision < newest {}
-            }
-            let thumbnails = keeping.statistics().thumbnail_bytes;
-            prop_assert!(thumbnails > 0, "the coarse levels are made of them");
-            let (old, fresh) = (read_all(&source).await, read_all(&fixture.open_with(options_of(rules)).await).await);
-            prop_assert!(old == fresh, "stale voxels");
-            prop_assert!(read_all(&keeping).await == fresh, "stale thumbnails");
-            // What the disk has now is what will be.
-            drop(source);
-            options.disk_cache.take().unwrap().close().await;
-            let mut options = cached(folder.path(), rules).await;
-            let again = fixture.open_with(options.clone()).await;
-            prop_assert!(read_all(&again).await == fresh, "stale voxels on disk");
-            let found = again.statistics().blocks_from_disk;
-            let any = fresh.iter().flatten().any(|v| *v != 0);
-            prop_assert_eq!(found > 0, any, "{} blocks found", found);
-            // A level is one block here; one without voxels is not worth keeping.
-            let empty = fresh.iter().filter(|level| level.iter().all(|v| *v == 0)).count();
-            let built = again.statistics().blocks_built;
-            prop_assert!(built <= empty as u64, "{} built, {} are empty", built, empty);
-            drop(again);
-            options.disk_cache.take().unwrap().close().await;
-            // The oracle leaves gaps as they are.
-            if rules.2 == Gaps::Empty {
-                let how = How {
-                    blend: rules.0 == Overlaps::Blend,
-                    along_z: rules.1 == AlongZ::Linear,
-                    ..How::PLAIN
+            Step::Shift(z, by) => {
+                let catalog = fixture.archive.catalog();
+                let tiles = catalog.section_tiles("v", z).await.unwrap();
+                let stays = |tile: &Tile| {
+                    let to = tile.transform.shifted(by.into()).elements();
+                    lies_in(&volume, z, tile.size, to)
                 };
-                let want = expected_as(&volume, &fixture.tiles, how);
-                let (coverage, most) = difference(&fresh, &want);
-                prop_assert_eq!((coverage, most <= 1), (0, true), "{} voxels, {}", coverage, most);
+                if tiles.iter().all(stays) {
+                    changed |= !tiles.is_empty();
+                    fixture.shift(z, by).await;
+                }
             }
-            Ok(())
-        })?;
+            Step::Delete(n) => changed |= fixture.delete(&format!("t{n}")).await,
+            Step::Reopen => {
+                drop((source, changes));
+                options.disk_cache.take().unwrap().close().await;
+                options = cached(folder.path(), rules).await;
+                source = fixture.open_with(options.clone()).await;
+                source.go_wrong(wrong);
+                (changes, changed) = (source.changes(), false);
+            }
+            Step::Read(n) => drop(source.read(ids[n % ids.len()]).await.unwrap()),
+            Step::Drop(n) => drop(source.read(ids[n % ids.len()]).now_or_never()),
+        }
     }
+    if changed {
+        caught_up(&fixture, &mut changes).await;
+    }
+    let newest = fixture.archive.catalog().revision("v").await.unwrap();
+    // By what is told, not by the number beside it, which may be a moment behind or ahead.
+    if newest > opened_at {
+        while kept_changes.next().await.unwrap().revision < newest {}
+    }
+    let thumbnails = keeping.statistics().thumbnail_bytes;
+    prop_assert!(thumbnails > 0, "the coarse levels are made of them");
+    let (old, fresh) = (
+        read_all(&source).await,
+        read_all(&fixture.open_with(options_of(rules)).await).await,
+    );
+    prop_assert!(old == fresh, "stale voxels");
+    prop_assert!(read_all(&keeping).await == fresh, "stale thumbnails");
+    // What the disk has now is what will be.
+    drop(source);
+    options.disk_cache.take().unwrap().close().await;
+    let mut options = cached(folder.path(), rules).await;
+    let again = fixture.open_with(options.clone()).await;
+    again.go_wrong(wrong);
+    prop_assert!(read_all(&again).await == fresh, "stale voxels on disk");
+    let found = again.statistics().blocks_from_disk;
+    let any = fresh.iter().flatten().any(|v| *v != 0);
+    prop_assert_eq!(found > 0, any, "{} blocks found", found);
+    // A level is one block here; one without voxels is not worth keeping.
+    let empty = fresh
+        .iter()
+        .filter(|level| level.iter().all(|v| *v == 0))
+        .count();
+    let built = again.statistics().blocks_built;
+    prop_assert!(
+        built <= empty as u64,
+        "{} built, {} are empty",
+        built,
+        empty
+    );
+    drop(again);
+    options.disk_cache.take().unwrap().close().await;
+    let how = How {
+        blend: rules.0 == Overlaps::Blend,
+        along_z: rules.1 == AlongZ::Linear,
+        gaps: rules.2.longest(),
+        gaps_mix: matches!(rules.2, Gaps::Linear(_)),
+        ..How::PLAIN
+    };
+    let want = expected_as(&volume, &fixture.tiles, how);
+    let (coverage, most) = difference(&fresh, &want);
+    prop_assert_eq!(
+        (coverage, most <= 1),
+        (0, true),
+        "{} voxels, {}",
+        coverage,
+        most
+    );
+    Ok(())
 }
 
 #[test]

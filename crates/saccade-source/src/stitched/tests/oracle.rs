@@ -141,6 +141,9 @@ pub(super) struct How {
     pub(super) between: Between,
     pub(super) blend: bool,
     pub(super) along_z: bool,
+    /// Gaps of at most so many sections are filled, from both sides or the nearer one.
+    pub(super) gaps: u32,
+    pub(super) gaps_mix: bool,
     pub(super) channel: u32,
     /// The largest value there is.
     pub(super) most: u16,
@@ -151,6 +154,8 @@ impl How {
         between: Between::Tent,
         blend: false,
         along_z: false,
+        gaps: 0,
+        gaps_mix: false,
         channel: 0,
         most: 255,
     };
@@ -165,14 +170,13 @@ pub(super) fn stitch(
     down: [f64; 3],
     how: How,
 ) -> Vec<u16> {
-    // Sections count with the tiles of all channels.
-    let mut with_tiles: Vec<u32> = tiles.values().map(|t| t.section).collect();
-    with_tiles.sort_unstable();
-    with_tiles.dedup();
     let tiles: BTreeMap<_, _> = tiles
         .iter()
         .filter(|(_, t)| t.channel == how.channel)
         .collect();
+    let mut with_tiles: Vec<u32> = tiles.values().map(|t| t.section).collect();
+    with_tiles.sort_unstable();
+    with_tiles.dedup();
     let wanted = |t: &RawTile| {
         (t.pixels_per_voxel() * (down[0] * down[1]).sqrt())
             .log2()
@@ -239,6 +243,22 @@ pub(super) fn stitch(
         let middle = (low + high) / 2.0;
         let mut sections = with_tiles.clone();
         sections.retain(|s| f64::from(*s) + 0.5 >= low && f64::from(*s) + 0.5 < high);
+        let mut fills = false;
+        if sections.is_empty() {
+            let before = with_tiles.iter().rfind(|s| f64::from(**s) + 0.5 < low);
+            let behind = with_tiles.iter().find(|s| f64::from(**s) + 0.5 >= high);
+            if let (Some(before), Some(behind)) = (before, behind)
+                && behind - before <= how.gaps + 1
+            {
+                let (a, b) = (f64::from(*before) + 0.5, f64::from(*behind) + 0.5);
+                sections = match how.gaps_mix {
+                    true => vec![*before, *behind],
+                    false if middle - a <= b - middle => vec![*before],
+                    false => vec![*behind],
+                };
+                fills = how.gaps_mix;
+            }
+        }
         let off = |s: &u32| (f64::from(*s) + 0.5 - middle).abs();
         sections.sort_by(|a, b| off(a).partial_cmp(&off(b)).unwrap().then(a.cmp(b)));
         // The nearest four are looked at, then the 8th, 16th, ...
@@ -274,7 +294,8 @@ pub(super) fn stitch(
             if count > 0.0 { sum / count } else { 0.0 }
         };
         let (all, lower, upper) = (near(&sections), near(&below), near(&above));
-        let mixes = how.along_z && !below.is_empty() && !above.is_empty() && off(&below[0]) > 0.0;
+        let mixes = fills
+            || (how.along_z && !below.is_empty() && !above.is_empty() && off(&below[0]) > 0.0);
         for y in 0..extent[1] {
             for x in 0..extent[0] {
                 let value = if mixes {
