@@ -18,6 +18,7 @@ mod kills_of_changes;
 mod labels;
 mod list_channels;
 mod lists;
+mod magnifications;
 mod no_effect;
 mod no_files;
 #[allow(dead_code, reason = "others use more of it")]
