@@ -12,6 +12,7 @@ mod ingest;
 mod petascale;
 mod render;
 mod resample;
+mod restart;
 mod section;
 mod serve;
 mod streaming;
@@ -99,6 +100,10 @@ pub(crate) static GROUPS: &[Group] = &[
     Group {
         ids: index::IDS,
         measure: |_| index::measure(),
+    },
+    Group {
+        ids: restart::IDS,
+        measure: |_| restart::measure(),
     },
     Group {
         ids: render::IDS,
