@@ -15,7 +15,7 @@ from PIL import Image
 from archive import BIN, BUCKET, SEED, ArchiveTest, Proxy, run
 from lib.saccade import until
 
-KILLS = 8
+KILLS = int(os.environ.get("SACCADE_TEST_KILLS", 8))
 CAMERA = ["--size", "320x240"]
 
 
