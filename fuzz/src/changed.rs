@@ -1,7 +1,33 @@
 //! Seeds, and seeds changed at random, for tests that run the fuzz targets.
+//!
+//! Every run of one seed number is the same. `SACCADE_FUZZ_SEED` chooses it, and a failure names it.
 
 use std::fs;
+use std::panic::catch_unwind;
 use std::path::Path;
+
+/// Runs a target on its seeds, and on so many that were changed.
+///
+/// # Panics
+///
+/// With the input that it does not survive, and where it has no seeds.
+pub fn survives(name: &str, target: fn(&[u8]), seeds: &[Vec<u8>], inputs: u32) {
+    assert!(!seeds.is_empty(), "{name} has no seeds");
+    let survived = |bytes: &[u8], which: String| {
+        let survived = catch_unwind(|| target(bytes)).is_ok();
+        let bytes = bytes.escape_ascii();
+        assert!(survived, "target {name}, {which}: \"{bytes}\"");
+    };
+    for (n, bytes) in seeds.iter().enumerate() {
+        survived(bytes, format!("seed {n} by name"));
+    }
+    let seed: u64 = std::env::var("SACCADE_FUZZ_SEED").map_or(1, |s| s.parse().expect("a number"));
+    let mut random = Random::new(seed);
+    for n in 0..inputs {
+        let bytes = changed(seeds, &mut random);
+        survived(&bytes, format!("SACCADE_FUZZ_SEED={seed}, input {n}"));
+    }
+}
 
 /// The same numbers for the same seed.
 pub struct Random(u64);
