@@ -1,30 +1,42 @@
 //! One function per parser of foreign bytes. Each may refuse; none may panic, or take much time or memory.
 
+use std::fs::{self, OpenOptions};
+use std::io::Write as _;
 use std::path::Path;
 
 use glam::UVec2;
 use saccade_archive::acquisition::{
-    AcquisitionInfo, Record, tile_configuration, tile_list, tile_specs, trakem2,
+    AcquisitionError, AcquisitionInfo, Cursor, Record, RecordReader, tile_configuration, tile_list,
+    tile_specs, trakem2,
 };
-use saccade_archive::image::{self, Image, Wanted};
+use saccade_archive::image::{self, Image, Pages, Wanted};
 use saccade_archive::pyramid::{self, Encoding, PyramidIndex};
+use saccade_archive::{ArchiveLocation, CatalogLocation, StorageLocation, read_identity};
 use saccade_core::volume::Dtype;
+
+use super::pieces::pieces;
+use super::scratch::Scratch;
 
 /// A parser.
 pub type Target = fn(&[u8]);
 
 /// All of them, by name.
-pub const TARGETS: [(&str, Target); 10] = [
+pub const TARGETS: [(&str, Target); 15] = [
     ("description", description),
     ("records", records),
+    ("record_file", record_file),
     ("tile_specs", tile_specs),
     ("tile_configuration", tile_configuration),
     ("tile_list", tile_list),
     ("trakem2", trakem2),
     ("image", image),
     ("image_of_size", image_of_size),
+    ("tiff_pages", tiff_pages),
     ("pyramid", pyramid),
     ("round_trip", round_trip),
+    ("percent_encoding", percent_encoding),
+    ("identity", identity),
+    ("archive_location", archive_location),
 ];
 
 fn somewhere() -> &'static Path {
@@ -68,6 +80,113 @@ fn records(bytes: &[u8]) {
 /// Whether numbers are so large that products of them may not be finite.
 fn far(elements: [f64; 6]) -> bool {
     elements.iter().any(|e| e.abs() > 1e150)
+}
+
+/// `tiles.jsonl` while it grows: read piece by piece, by readers that end and others that go on, it holds the records of the
+/// whole. The first byte chooses the pieces.
+fn record_file(bytes: &[u8]) {
+    let Some((&choice, bytes)) = bytes.split_first() else {
+        return;
+    };
+    let scratch = Scratch::new("records");
+    let folder = scratch.path();
+    let path = scratch.write(RecordReader::FILE, bytes);
+    let mut whole = RecordReader::new(folder, Cursor::default());
+    let lines = whole.read(usize::MAX).expect("a file is read");
+    let end = whole.cursor();
+    let is_end = |b: &u8| *b == b'\n';
+    assert_eq!(
+        end.offset as usize,
+        bytes.iter().rposition(is_end).map_or(0, |n| n + 1)
+    );
+    assert_eq!(end.line, bytes.iter().filter(|b| is_end(b)).count() as u64);
+    let mut before = Cursor::default();
+    for line in &lines {
+        let (from, to) = (line.offset as usize, line.next.offset as usize);
+        assert!(before.offset <= line.offset && from < to && to <= bytes.len());
+        assert!(before.line < line.next.line, "{before:?} {line:?}");
+        let text = bytes[from..to].strip_suffix(b"\n").expect("whole lines");
+        let text = match from {
+            0 => text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text),
+            _ => text,
+        };
+        assert!(!text.contains(&b'\n') && !text.iter().all(u8::is_ascii_whitespace));
+        match (&line.record, Record::parse(text)) {
+            (Ok(one), Ok(other)) => assert_eq!(*one, other),
+            (Err(broken), Err(_)) => {
+                assert_eq!(broken.line, line.next.line);
+                // Whatever the line is.
+                assert!(
+                    broken.reason.len() < 4096,
+                    "{} bytes of reason",
+                    broken.reason.len()
+                );
+            }
+            (one, other) => panic!("{one:?} of a file, {other:?} of a line"),
+        }
+        before = line.next;
+    }
+
+    fs::write(&path, b"").expect("a temporary file");
+    let mut reader = RecordReader::new(folder, Cursor::default());
+    let mut found = Vec::new();
+    for piece in pieces(choice, bytes) {
+        let appended = OpenOptions::new().append(true).open(&path);
+        let appended = appended.and_then(|mut file| file.write_all(piece));
+        appended.expect("a temporary file");
+        loop {
+            let some = reader
+                .read(1 + usize::from(choice) % 5)
+                .expect("it only grows");
+            if some.is_empty() {
+                break;
+            }
+            found.extend(some);
+        }
+        assert!(reader.is_between_lines().expect("it is there"));
+        reader = RecordReader::new(folder, reader.cursor());
+    }
+    assert_eq!((&found, reader.cursor()), (&lines, end));
+
+    let Some(resumed) = lines.get(usize::from(choice) % lines.len().max(1)) else {
+        return;
+    };
+    let rest = whole.at(resumed.next).read(usize::MAX).expect("it goes on");
+    assert!(
+        lines.ends_with(&rest)
+            && rest
+                .first()
+                .is_none_or(|line| line.offset >= resumed.next.offset)
+    );
+    assert_eq!(
+        rest.len(),
+        lines
+            .iter()
+            .filter(|line| line.offset >= resumed.next.offset)
+            .count()
+    );
+    // A cursor that knows only where it is learns what lies before it.
+    let mut blind = whole.at(Cursor {
+        seen: None,
+        ..resumed.next
+    });
+    assert_eq!(blind.recognize().expect("it is there"), resumed.next);
+    // Others in their place are no records that were read, and neither are fewer.
+    let offset = resumed.next.offset as usize;
+    let mut others = bytes.to_vec();
+    others[offset - 1] ^= 1;
+    fs::write(&path, &others).expect("a temporary file");
+    let replaced = whole.at(resumed.next).read(1);
+    assert!(
+        matches!(replaced, Err(AcquisitionError::RecordsReplaced { .. })),
+        "{replaced:?}"
+    );
+    fs::write(&path, &bytes[..offset - 1]).expect("a temporary file");
+    let cut = whole.at(resumed.next).read(1);
+    assert!(
+        matches!(cut, Err(AcquisitionError::RecordsCut { .. })),
+        "{cut:?}"
+    );
 }
 
 fn tile_specs(bytes: &[u8]) {
@@ -134,6 +253,43 @@ fn image_of_size(bytes: &[u8]) {
     }
 }
 
+/// A TIFF file of several pages: what is said of a page is what it is, in whatever order they are asked for.
+fn tiff_pages(bytes: &[u8]) {
+    // As of single images.
+    if bytes.len() > 1 << 14 {
+        return;
+    }
+    let scratch = Scratch::new("pages");
+    let path = scratch.write("stack.tif", bytes);
+    let Ok(mut pages) = Pages::open(&path) else {
+        return;
+    };
+    // Each begins somewhere else.
+    assert!((1..=bytes.len()).contains(&(pages.count() as usize)));
+    let some = pages.count().min(6);
+    let looked: Vec<_> = (0..some)
+        .map(|page| pages.check(page, Wanted::GRAY_16))
+        .collect();
+    let decoded: Vec<_> = (0..some)
+        .map(|page| pages.decode(page, Wanted::GRAY_16))
+        .collect();
+    for page in (0..some).rev() {
+        let n = page as usize;
+        match (&looked[n], &decoded[n]) {
+            (Ok([width, height]), Ok(Image::Uint16(image))) => {
+                assert_eq!((*width, *height), (image.width, image.height));
+                let again = pages.decode(page, Wanted::GRAY_16);
+                assert_eq!(again.expect("once more"), Image::Uint16(image.clone()));
+            }
+            (Err(_), Ok(_)) => panic!("page {page} is refused, and decoded"),
+            (_, Ok(other)) => panic!("{other:?} instead of 16 bits"),
+            (_, Err(_)) => assert!(pages.decode(page, Wanted::GRAY_16).is_err()),
+        }
+    }
+    let beyond = pages.check(pages.count(), Wanted::GRAY_16);
+    assert!(beyond.is_err(), "there is no such page");
+}
+
 /// A pyramid's index, and all sub-tiles that it speaks of.
 fn pyramid(bytes: &[u8]) {
     let Ok(index) = PyramidIndex::parse(bytes, "somewhere") else {
@@ -192,4 +348,67 @@ fn round_trip(bytes: &[u8]) {
             Image::Uint16(image.clone())
         );
     }
+}
+
+/// Names that lists may have taken from URLs.
+fn percent_encoding(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else {
+        return;
+    };
+    if let Some(decoded) = tile_list::decoded(text) {
+        assert!(
+            decoded.len() < text.len() && text.contains('%'),
+            "{decoded:?}"
+        );
+        let slashes = |text: &str| text.matches(['/', '\\']).count();
+        assert!(slashes(&decoded) == slashes(text) && !decoded.contains('\0'));
+    }
+    // What is encoded letter by letter is decoded.
+    let encoded: String = text.bytes().map(|b| format!("%{b:02x}")).collect();
+    let plain = !text.is_empty() && !text.contains(['/', '\\', '\0']);
+    assert_eq!(
+        tile_list::decoded(&encoded).as_deref(),
+        plain.then_some(text)
+    );
+}
+
+/// The object that says to which catalog a storage belongs.
+fn identity(bytes: &[u8]) {
+    if let Some(identity) = read_identity(bytes) {
+        assert_eq!(identity.len(), 32);
+        let line = format!("{identity}\n");
+        assert_eq!(read_identity(line.as_bytes()), Some(identity));
+        // One that is cut is none.
+        assert_eq!(read_identity(&line.as_bytes()[..31]), None);
+    }
+}
+
+/// Where an archive and its catalog are: two lines.
+fn archive_location(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else {
+        return;
+    };
+    let (storage, catalog) = text.split_once('\n').unwrap_or((text, ""));
+    let catalog: Option<CatalogLocation> = catalog.parse().ok();
+    // Whatever is in a password: nothing of it is shown.
+    let secret = CatalogLocation::parse(&format!("postgres://me:hush{text}hush@host/db"));
+    assert!(
+        !secret.to_string().contains("hush") || text.contains("hush"),
+        "{secret}"
+    );
+    let Ok(storage) = storage.parse::<StorageLocation>() else {
+        return;
+    };
+    assert_eq!(storage.to_string().parse(), Ok(storage.clone()));
+    if let StorageLocation::Bucket(bucket) = &storage {
+        let parts: Vec<&str> = bucket.prefix().split('/').collect();
+        assert!(
+            bucket.prefix().is_empty()
+                || parts.iter().all(|part| !matches!(*part, "" | "." | ".."))
+        );
+        assert!(!bucket.bucket().is_empty() && !bucket.bucket().contains('/'));
+    }
+    let is_folder = matches!(storage, StorageLocation::Folder(_));
+    let archive = ArchiveLocation::new(storage, catalog.clone());
+    assert_eq!(archive.is_ok(), is_folder || catalog.is_some());
 }

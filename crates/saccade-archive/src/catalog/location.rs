@@ -62,11 +62,16 @@ impl fmt::Debug for CatalogLocation {
 
 /// Leaves out whatever may hold a secret: the password, and the parameters.
 fn without_password(url: &str) -> String {
-    let url = url.split_once('?').map_or(url, |(before, _)| before);
+    let (url, parameters) = url.split_once('?').unwrap_or((url, ""));
     let Some((scheme, rest)) = url.split_once("://") else {
         return url.to_owned();
     };
     match rest.rsplit_once('@') {
+        // The question mark may be the password's.
+        None if parameters.contains('@') => {
+            let name = rest.split([':', '/']).next().unwrap_or_default();
+            format!("{scheme}://{name}")
+        }
         Some((login, place)) => {
             let user = login.split_once(':').map_or(login, |(user, _)| user);
             format!("{scheme}://{user}@{place}")
@@ -106,5 +111,7 @@ mod tests {
         }
         let open = CatalogLocation::parse("postgres://host/db");
         assert_eq!(open.to_string(), "postgres://host/db");
+        let half = CatalogLocation::parse("postgres://me:hush?hush@host/db");
+        assert_eq!(half.to_string(), "postgres://me");
     }
 }
