@@ -141,6 +141,49 @@ fn number(text: &str) -> Option<u32> {
     plain.then(|| text.parse().ok())?
 }
 
+/// Names of objects: each names one thing, which lies in the volume, and there is no other name for it.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    let Ok(key) = std::str::from_utf8(bytes) else {
+        return;
+    };
+    let size = UVec3::new(1000, 900, 50);
+    let plain = Volume::new("em", size, glam::DVec3::new(4.0, 4.0, 40.0)).expect("a volume");
+    let moved = Volume {
+        chunk: UVec3::new(64, 48, 32),
+        channels: vec!["a".to_owned(), "b".to_owned()],
+        origin_nm: glam::DVec3::new(-4000.0, 0.0, 1e9),
+        ..plain.clone()
+    };
+    for (volume, format) in [&plain, &moved]
+        .into_iter()
+        .flat_map(|v| Format::ALL.map(|f| (v, f)))
+    {
+        match format.entry(volume, key) {
+            Err(Unknown { known }) => assert!(!known.is_empty(), "what there is instead is told"),
+            Ok(Entry::Metadata(value)) => assert!(value.is_object()),
+            Ok(Entry::Piece(piece)) => {
+                let level = level_index(volume, piece.level).expect("it has the level");
+                assert!(has_chunk(volume, piece.level, piece.chunk));
+                assert!(
+                    piece.channels.end as usize <= volume.channels.len()
+                        && !piece.channels.is_empty()
+                );
+                let voxels = piece.voxels;
+                assert!(!voxels.is_empty() && voxels.max.cmple(volume.chunk).all());
+                let UVec3 { x, y, z } = piece.chunk;
+                let c = piece.channels.start;
+                let only = match format {
+                    Format::Zarr3 => format!("{level}/c/{c}/{z}/{y}/{x}"),
+                    Format::Zarr2 => format!("{level}/{c}/{z}/{y}/{x}"),
+                    Format::Precomputed => continue,
+                };
+                assert_eq!(key, only);
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -62,6 +62,8 @@ mod archive;
 mod assets;
 mod events;
 mod formats;
+#[cfg(any(test, fuzzing))]
+pub mod fuzz_targets;
 mod history;
 mod http;
 mod index;

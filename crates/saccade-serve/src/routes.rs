@@ -17,7 +17,8 @@ use axum::middleware::{Next, from_fn_with_state, map_request, map_response};
 use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use saccade_core::volume::Dtype;
+use glam::UVec3;
+use saccade_core::volume::{Dtype, Volume};
 use saccade_source::remote::{NOTHING_ACQUIRED, RENAMED_LABEL};
 use saccade_source::{Change, ChunkId};
 use tokio::sync::{Semaphore, watch};
@@ -496,30 +497,10 @@ pub(crate) async fn ranges(
         Err(refusal) => return *refusal,
     };
     let volume = published.volume().clone();
-    let parse = |text: &str| {
-        let axes: Vec<u32> = { text.split(',') }
-            .map(|n| n.parse().ok())
-            .collect::<Option<_>>()?;
-        let chunk = <[u32; 3]>::try_from(axes).ok()?.into();
-        let id = ChunkId {
-            channel,
-            level,
-            chunk,
-        };
-        id.voxels(&volume).map(|_| id)
+    let ids = match listed(&volume, (channel, level), &chunks) {
+        Ok(ids) => ids,
+        Err(error) => return bad_request(error),
     };
-    let ids = chunks.split(';').map(parse).take(MOST_RANGES + 1);
-    let ids: Vec<ChunkId> = match ids.collect::<Option<_>>() {
-        Some(ids) => ids,
-        None => {
-            return bad_request(format!(
-                "the volume has not all of these chunks: {chunks:?}"
-            ));
-        }
-    };
-    if ids.len() > MOST_RANGES {
-        return bad_request(format!("ask for {MOST_RANGES} chunks at most"));
-    }
     let most = match volume.dtype {
         Dtype::Uint8 => u16::from(u8::MAX),
         _ => u16::MAX,
@@ -537,6 +518,58 @@ pub(crate) async fn ranges(
         Err(_) => vec![Some([1, most]); ids.len()],
     };
     described(RangeList { ranges })
+}
+
+/// Chunks as `x,y,z`, with semicolons between them; or why there are no such.
+fn listed(
+    volume: &Volume,
+    (channel, level): (u32, u32),
+    chunks: &str,
+) -> Result<Vec<ChunkId>, String> {
+    let parse = |text: &str| {
+        let mut axes = text.split(',').map(|n| n.parse().ok());
+        let mut axis = || axes.next()?;
+        let chunk = UVec3::new(axis()?, axis()?, axis()?);
+        let id = ChunkId {
+            channel,
+            level,
+            chunk,
+        };
+        (axes.next().is_none() && id.voxels(volume).is_some()).then_some(id)
+    };
+    let ids = chunks.split(';').map(parse).take(MOST_RANGES + 1);
+    let ids: Option<Vec<ChunkId>> = ids.collect();
+    let ids = ids.ok_or_else(|| format!("the volume has not all of these chunks: {chunks:?}"))?;
+    match ids.len() > MOST_RANGES {
+        true => Err(format!("ask for {MOST_RANGES} chunks at most")),
+        false => Ok(ids),
+    }
+}
+
+/// Chunks whose bounds are asked for: all that are listed lie in the volume, and listed again they are the same.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else {
+        return;
+    };
+    let size = UVec3::new(1000, 900, 50);
+    let volume = Volume::new("em", size, glam::DVec3::new(4.0, 4.0, 40.0)).expect("a volume");
+    for of in [(0, 0), (0, 1), (1, 0), (0, u32::MAX)] {
+        let Ok(ids) = listed(&volume, of, text) else {
+            continue;
+        };
+        assert_eq!(of.0, 0, "there is one channel");
+        assert!((1..=MOST_RANGES).contains(&ids.len()));
+        assert!(
+            { ids.iter() }.all(|id| (id.channel, id.level) == of && id.voxels(&volume).is_some())
+        );
+        let again = ids.iter().map(|id| {
+            let [x, y, z] = id.chunk.to_array();
+            format!("{x},{y},{z}")
+        });
+        let again: Vec<_> = again.collect();
+        assert_eq!(listed(&volume, of, &again.join(";")), Ok(ids));
+    }
 }
 
 fn bad_request(error: String) -> Response {
@@ -559,7 +592,6 @@ fn find(app: &App, name: &str) -> Result<Arc<Published>, Box<Response>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::UVec3;
     use saccade_core::voxel_box::VoxelBox;
     use saccade_source::ChangeReason;
 

@@ -21,6 +21,8 @@ pub(crate) use access::Gate;
 pub use access::{Access, Origins};
 pub use limits::Limits;
 pub(crate) use streams::{StreamPlace, Streams};
+#[cfg(any(test, fuzzing))]
+pub(crate) use {access::fuzz as fuzz_access, heads::fuzz as fuzz_heads};
 
 use crate::routes::{App, router};
 use crate::volumes::Volumes;

@@ -44,6 +44,42 @@ pub(crate) fn requested(headers: &HeaderMap, len: usize, tag: Option<&Tag>) -> R
     }
 }
 
+/// A range of a body, and the state for which it holds: two lines.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    use axum::http::HeaderValue;
+
+    let mut lines = bytes.splitn(2, |b| *b == b'\n');
+    let mut value = || HeaderValue::from_bytes(lines.next()?).ok();
+    let (Some(range), state) = (value(), value()) else {
+        return;
+    };
+    let tag = Tag::new("0123-4");
+    for len in [0, 1, 10, usize::MAX] {
+        let mut headers = HeaderMap::new();
+        headers.insert(RANGE, range.clone());
+        let plain = requested(&headers, len, Some(&tag));
+        if let Requested::Part(part) = &plain {
+            assert!(
+                part.start < part.end && part.end <= len,
+                "{part:?} of {len}"
+            );
+            // Said in its own words, it is the same.
+            let said = format!("bytes={}-{}", part.start, part.end - 1);
+            headers.insert(RANGE, HeaderValue::from_str(&said).expect("digits"));
+            assert_eq!(requested(&headers, len, Some(&tag)), plain);
+            headers.insert(RANGE, range.clone());
+        }
+        if let Some(state) = &state {
+            headers.insert(IF_RANGE, state.clone());
+            let conditional = requested(&headers, len, Some(&tag));
+            let is_so = *state == tag.header();
+            assert_eq!(conditional, if is_so { plain } else { Requested::Whole });
+            assert_eq!(requested(&headers, len, None), Requested::Whole);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

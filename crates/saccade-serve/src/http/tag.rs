@@ -84,6 +84,44 @@ pub(crate) async fn mark_encoding(mut response: Response) -> Response {
     response
 }
 
+/// Conditions on a state: values of `If-Match` and of `If-None-Match`, two lines.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    let mut lines = bytes.splitn(2, |b| *b == b'\n');
+    let mut value = || HeaderValue::from_bytes(lines.next()?).ok();
+    let (wanted, held) = (value(), value());
+    let tag = Tag::new("0123-4");
+    let of = |value: &HeaderValue, part: &str| value.to_str().is_ok_and(|text| text.contains(part));
+    let names = |value: &HeaderValue| of(value, "0123-4") || of(value, "*");
+    let mut headers = HeaderMap::new();
+    if let Some(held) = &held {
+        headers.insert(IF_NONE_MATCH, held.clone());
+        match tag.precondition(&headers) {
+            Some(answer) => {
+                assert_eq!(answer.status(), StatusCode::NOT_MODIFIED);
+                assert!(names(held), "{held:?}");
+                let said = &answer.headers()[ETAG];
+                assert!(
+                    *said == tag.header() || *said == quoted("0123-4-gzip"),
+                    "{said:?}"
+                );
+            }
+            None => assert!(*held != tag.header() && *held != quoted("0123-4-gzip") && held != "*"),
+        }
+    }
+    if let Some(wanted) = &wanted {
+        headers = HeaderMap::from_iter([(IF_MATCH, wanted.clone())]);
+        match tag.precondition(&headers) {
+            Some(answer) => {
+                assert_eq!(answer.status(), StatusCode::PRECONDITION_FAILED);
+                assert!(*wanted != tag.header() && wanted != "*");
+            }
+            None => assert!(names(wanted), "{wanted:?}"),
+        }
+        assert_eq!(tag.is(wanted), *wanted == tag.header());
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

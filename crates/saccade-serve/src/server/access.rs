@@ -136,6 +136,58 @@ fn own_name() -> Option<String> {
     (!name.is_empty()).then(|| name.to_owned())
 }
 
+/// The host that a request is for, by its first line and by its header, and the page that it comes from: three lines. Names of
+/// strangers are never answered.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    use axum::http::HeaderValue;
+
+    let lines: Vec<&[u8]> = bytes.splitn(3, |b| *b == b'\n').collect();
+    let &[target, host, origin] = &lines[..] else {
+        return;
+    };
+    let target = std::str::from_utf8(target)
+        .ok()
+        .filter(|target| !target.is_empty());
+    let [Ok(host), Ok(origin)] = [host, origin].map(HeaderValue::from_bytes) else {
+        return;
+    };
+    let access = Access {
+        hosts: vec!["em.lab.example".to_owned()],
+        origins: Origins::Only(vec!["https://viewer.example".to_owned()]),
+    };
+    let gate = Gate::of(&access, Some("microscope"));
+    let mut headers = HeaderMap::from_iter([(HOST, host.clone())]);
+    let status = |headers: &HeaderMap| {
+        let refusal = gate.refuse(Version::HTTP_11, target, headers);
+        refusal.map(|answer| answer.status())
+    };
+    if status(&headers).is_none() {
+        let host = host.to_str().expect("it was understood");
+        let authority: Authority = host.parse().expect("it was understood");
+        for name in target.into_iter().chain([authority.host()]) {
+            let name = name.to_ascii_lowercase();
+            let name = name
+                .trim_end_matches('.')
+                .rsplit('.')
+                .next()
+                .unwrap_or_default();
+            let is_known = ["localhost", "microscope", "local", "example"].contains(&name);
+            let is_number = name.ends_with(']') || name.parse::<u8>().is_ok();
+            assert!(is_known || is_number, "{name:?} is a stranger's");
+        }
+        // Pages of strangers are not, either.
+        headers.insert(ORIGIN, origin.clone());
+        if status(&headers).is_none() {
+            let origin = origin.to_str().expect("it was understood");
+            let own = origin.ends_with(&format!("://{authority}"));
+            assert!(own || origin == "https://viewer.example", "{origin:?}");
+        }
+    }
+    headers.append(HOST, host);
+    assert_eq!(status(&headers), Some(StatusCode::BAD_REQUEST), "two hosts");
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

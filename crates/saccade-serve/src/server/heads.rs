@@ -34,10 +34,13 @@ impl Held {
         };
         let seen = self.bytes.len().saturating_sub(2);
         self.bytes.extend_from_slice(bytes);
-        if is_hopeless(&self.bytes[self.whole..]) {
-            self.whole = self.bytes.len();
-        } else if let Some(end) = end_of_heads(&self.bytes[seen..]) {
+        if let Some(end) = end_of_heads(&self.bytes[seen..]) {
             self.whole = self.whole.max(seen + end);
+        }
+        // Behind whole ones as well: nobody looks at it before more comes.
+        let next = &self.bytes[self.whole..];
+        if is_hopeless(&next[empty_lines(next)..]) {
+            self.whole = self.bytes.len();
         }
         self.whole > 0
     }
@@ -282,6 +285,68 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Heads<S> {
     }
 }
 
+/// Requests as they come in, in pieces, to a parser with little room: it sees the same whole heads however they come, until
+/// something comes that is none. The first byte chooses the pieces.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    use crate::fuzz_targets::pieces::pieces;
+
+    /// Heads without what is between them, what is left, and whether that may become one.
+    fn heads(mut rest: &[u8]) -> (Vec<u8>, &[u8], bool) {
+        let mut heads = Vec::new();
+        loop {
+            rest = &rest[empty_lines(rest)..];
+            let is_end =
+                |end: &usize| rest[..*end].ends_with(b"\n\r\n") || rest[..*end].ends_with(b"\n\n");
+            let end = (2..=rest.len()).find(is_end);
+            let (next, after) = rest.split_at(end.unwrap_or(rest.len()));
+            if next.len() > HEAD_BYTES || is_hopeless(next) {
+                return (heads, rest, false);
+            }
+            if end.is_none() {
+                return (heads, rest, true);
+            }
+            heads.extend_from_slice(next);
+            rest = after;
+        }
+    }
+    let Some((&choice, bytes)) = bytes.split_first() else {
+        return;
+    };
+    let (want, rest, goes_on) = heads(bytes);
+    let room = usize::from(choice) + 1;
+    for (pieces, room) in [(vec![bytes], 8192), (pieces(choice, bytes), room)] {
+        let (mut held, mut seen) = (Held::default(), Vec::new());
+        let mut space = vec![0; room];
+        // So much is read at a time.
+        for piece in pieces.iter().flat_map(|piece| piece.chunks(2048)) {
+            held.add(piece);
+            while held.whole > 0 {
+                let mut buffer = ReadBuf::new(&mut space);
+                held.give(&mut buffer);
+                seen.extend_from_slice(buffer.filled());
+            }
+            let most = held.bytes.len();
+            assert!(most <= HEAD_BYTES, "{most} bytes are held");
+        }
+        let (seen, left, whole) = heads(&seen);
+        assert_eq!(seen, want);
+        // What may become a head is held, all of it; what is none is not waited for.
+        assert_eq!(whole, goes_on);
+        if goes_on {
+            assert_eq!((left, &held.bytes[..]), (&[][..], rest));
+        }
+    }
+    // What a parser gives back comes first.
+    let mut held = Held::default();
+    held.add(bytes);
+    let mut space = vec![0; room];
+    let mut buffer = ReadBuf::new(&mut space);
+    held.give(&mut buffer);
+    let all = [buffer.filled(), &held.bytes].concat();
+    assert_eq!(held.behind(buffer.filled()).bytes, all);
+}
+
 #[cfg(test)]
 mod tests {
     use std::pin::pin;
@@ -334,6 +399,10 @@ mod tests {
         ] {
             assert!(Held::default().add(nonsense), "{nonsense:?}");
         }
+        // Nor behind one, where nothing more may come.
+        let mut behind = Held::default();
+        assert!(behind.add(&[HEAD, b"\x16\x03\x01"].concat()));
+        assert_eq!(behind.whole, HEAD.len() + 3);
         let mut long = b"GET / HTTP/1.1\r\nX: ".to_vec();
         assert!(!Held::default().add(&long));
         long.resize(HEAD_BYTES + 1, b'y');
