@@ -51,6 +51,9 @@ use queue::{Changes, Queue};
 use shard::ShardEncoder;
 use sound::sound;
 
+#[cfg(any(test, fuzzing))]
+pub(crate) use {plan::fuzz_state, sound::fuzz_description, sound::fuzz_shard};
+
 /// Object in which an export says what it is, as long as it is not whole.
 pub const UNFINISHED: &str = "export.json";
 /// What makes a folder an image.

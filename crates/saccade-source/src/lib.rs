@@ -29,6 +29,8 @@ mod decoding;
 #[cfg(not(target_family = "wasm"))]
 pub mod export;
 mod flights;
+#[cfg(all(any(test, fuzzing), not(target_family = "wasm")))]
+pub mod fuzz_targets;
 pub mod images;
 pub mod maybe_send;
 pub mod memory;

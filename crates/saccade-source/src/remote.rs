@@ -3,6 +3,8 @@
 mod chunks;
 mod event_parser;
 mod events;
+#[cfg(all(any(test, fuzzing), not(target_family = "wasm")))]
+pub(crate) mod fuzz_targets;
 mod ranges;
 mod since;
 mod status;
@@ -318,21 +320,10 @@ impl RemoteSource {
         let url = address(base, &["v", name])?;
         let json = joined(&url, &["volume.json"]);
         let described: VolumeJson = get_json(client, json.clone(), options).await?;
-        let volume = &described.volume;
-        let axes = volume.chunk.to_array().map(u64::from);
-        let bytes = volume.dtype.bytes() as u64;
-        let bytes = axes.iter().try_fold(bytes, |n, edge| n.checked_mul(*edge));
-        let wrong = match check_volume(volume) {
-            Err(violation) => Some(violation.into()),
-            Ok(()) if bytes.is_none_or(|bytes| bytes > LARGEST_CHUNK) => {
-                Some(format!("chunks of {} voxels are too large", volume.chunk).into())
-            }
-            Ok(()) => None,
-        };
-        if let Some(source) = wrong {
-            return Err(RemoteError::Answer { source, url: json });
+        match check_described(&described.volume) {
+            Ok(()) => Ok((url, described)),
+            Err(source) => Err(RemoteError::Answer { source, url: json }),
         }
-        Ok((url, described))
     }
 }
 
@@ -383,6 +374,18 @@ impl VolumeSource for RemoteSource {
     fn notes(&self) -> &[String] {
         &self.notes
     }
+}
+
+/// Refuses what no server's volume can be.
+fn check_described(volume: &Volume) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    check_volume(volume)?;
+    let axes = volume.chunk.to_array().map(u64::from);
+    let bytes = volume.dtype.bytes() as u64;
+    let bytes = axes.iter().try_fold(bytes, |n, edge| n.checked_mul(*edge));
+    if bytes.is_none_or(|bytes| bytes > LARGEST_CHUNK) {
+        return Err(format!("chunks of {} voxels are too large", volume.chunk).into());
+    }
+    Ok(())
 }
 
 fn open_error(error: RemoteError, location: &str) -> SourceError {

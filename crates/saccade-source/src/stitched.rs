@@ -79,6 +79,9 @@ use tokio::task::AbortHandle;
 use crate::changes::Changes;
 use crate::maybe_send::{BoxFuture, BoxStream};
 use crate::{Change, Chunk, ChunkError, ChunkId, Damage, SourceError, ValueRange, VolumeSource};
+#[cfg(any(test, fuzzing))]
+pub(crate) use {block::fuzz as fuzz_block, thumbnails::fuzz as fuzz_thumbnail};
+
 use block::{BlockGrid, CutChunk};
 use blocks::Blocks;
 use build::{Builder, Place, Rules};

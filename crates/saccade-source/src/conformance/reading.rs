@@ -2,7 +2,7 @@ use futures::FutureExt;
 use futures::future::{join_all, try_join_all};
 use glam::UVec3;
 use saccade_core::brick::{MAX_CHANNELS, MAX_LEVELS};
-use saccade_core::volume::Volume;
+use saccade_core::volume::{MAX_EXTENT, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
 use super::{Oracle, Violation, compare, ensure, read_bytes, violation};
@@ -36,6 +36,12 @@ pub fn check_volume(volume: &Volume) -> Result<(), Violation> {
         format!("its voxels are of {nm} nm")
     })?;
     let finest = volume.levels[0];
+    ensure(finest.extent.max_element() <= MAX_EXTENT, RULE, || {
+        format!(
+            "it has {} voxels, more than {MAX_EXTENT} along an axis",
+            finest.extent
+        )
+    })?;
     ensure(finest.downsampling == glam::DVec3::ONE, RULE, || {
         format!("level 0 is downsampled by {}", finest.downsampling)
     })?;

@@ -312,6 +312,34 @@ fn shard_size(size: UVec3, chunk: UVec3, dtype: Dtype) -> UVec3 {
     along * chunk
 }
 
+/// What an export says of itself, which may be another's or none: the same goes on and differs in nothing, others are told
+/// apart.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz_state(bytes: &[u8]) {
+    let there: Value = serde_json::from_slice(bytes).unwrap_or_default();
+    let extent = UVec3::new(100, 90, 80);
+    let volume = Volume::new("v", extent, glam::DVec3::ONE).expect("a volume");
+    let options = ExportOptions {
+        rename_labels: true,
+        ..ExportOptions::default()
+    };
+    let now = Plan::new(&Arc::new(volume), &options)
+        .expect("a plan")
+        .description();
+    assert!(goes_on(&there, &there) && goes_on(&now, &now));
+    let told = differences(&there, &now);
+    assert!(!told.is_empty());
+    if goes_on(&there, &now) {
+        // But for the names of ids.
+        assert!(there == now || told.contains("renamed"), "{told}");
+        assert_eq!(there["arrays"], now["arrays"]);
+    }
+    assert_eq!(
+        differences(&there, &there),
+        "its levels or chunks are others"
+    );
+}
+
 #[cfg(test)]
 mod tests {
     use glam::DVec3;

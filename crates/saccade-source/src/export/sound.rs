@@ -96,3 +96,70 @@ async fn has_index(
         && crc32c::crc32c(pairs) == u32::from_le_bytes(*sum)
         && words.chunks_exact(2).all(lies_before))
 }
+
+/// A shard of which only the checksum of the index is right: its chunks lie before the index, or it is not sound. The first byte
+/// chooses how many chunks it has.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz_shard(bytes: &[u8]) {
+    use futures::FutureExt as _;
+    use saccade_archive::storage::MemoryStorage;
+
+    let Some((&chunks, bytes)) = bytes.split_first() else {
+        return;
+    };
+    let chunks = u64::from(chunks % 16) + 1;
+    let begin = bytes
+        .len()
+        .saturating_sub(16 * usize::try_from(chunks).expect("a few"));
+    let sum = crc32c::crc32c(&bytes[begin..]).to_le_bytes();
+    let storage = MemoryStorage::new();
+    let is_sound = |shard: Vec<u8>| {
+        let size = shard.len() as u64;
+        let looked = async {
+            storage
+                .write_durable("0/c/0", shard.into())
+                .await
+                .expect("memory");
+            has_index(&storage, "0/c/0", size, chunks)
+                .await
+                .expect("memory")
+        };
+        looked.now_or_never().expect("memory is not waited for")
+    };
+    let mut shard = [bytes, &sum].concat();
+    if !is_sound(shard.clone()) {
+        return;
+    }
+    assert_eq!((bytes.len() - begin) as u64, 16 * chunks);
+    for pair in bytes[begin..].chunks_exact(16) {
+        let [offset, len] = [0, 8].map(|at| {
+            let word = pair[at..at + 8].try_into().expect("eight bytes");
+            u128::from(u64::from_le_bytes(word))
+        });
+        let is_none = [offset, len] == [NONE.into(); 2];
+        assert!(is_none || offset + len <= begin as u128, "{offset} + {len}");
+    }
+    // One that is cut, or of which a bit of the index fell over, is not.
+    assert!(!is_sound(shard[..shard.len() - 1].to_vec()));
+    let last = shard.len() - 5;
+    shard[last] ^= 1;
+    assert!(!is_sound(shard));
+}
+
+/// A level's description, as far as it says more than what it was exported of.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz_description(bytes: &[u8]) {
+    let Some(said) = without_state(bytes) else {
+        return;
+    };
+    assert!(said.pointer(&format!("/attributes/{OURS}")).is_none());
+    let again = serde_json::to_vec(&said).expect("it was JSON");
+    assert_eq!(without_state(&again), Some(said.clone()));
+    // What it was exported of does not matter, where there is room to say it.
+    let mut other = said.clone();
+    if let Some(attributes) = other.get_mut("attributes").and_then(Value::as_object_mut) {
+        attributes.insert(OURS.to_owned(), 7.into());
+        let other = serde_json::to_vec(&other).expect("it was JSON");
+        assert_eq!(without_state(&other), Some(said));
+    }
+}

@@ -106,12 +106,24 @@ impl fmt::Display for Location {
         match self {
             #[cfg(not(target_family = "wasm"))]
             Self::Folder(folder) => folder.display().fmt(f),
-            Self::Http(address) => {
-                f.write_str(address.split(['?', '#']).next().unwrap_or_default())
-            }
+            Self::Http(address) => f.write_str(&shown(address)),
             #[cfg(not(target_family = "wasm"))]
             Self::S3(bucket) => bucket.fmt(f),
         }
+    }
+}
+
+/// An address without what may be secret: its password, its query.
+fn shown(address: &str) -> String {
+    let address = address.split(['?', '#']).next().unwrap_or_default();
+    let (scheme, rest) = address.split_once("://").unwrap_or(("", address));
+    let (server, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+    match server.rsplit_once('@') {
+        Some((login, host)) => {
+            let user = login.split(':').next().unwrap_or_default();
+            format!("{scheme}://{user}@{host}{path}")
+        }
+        None => address.to_owned(),
     }
 }
 
@@ -128,6 +140,7 @@ mod tests {
                 "https://storage.googleapis.com/b/em/v1",
                 "v1",
             ),
+            ("https://me:hush@h/a", "https://me@h/a", "a"),
             ("zarr://s3://b/x", "s3://b/x", "x"),
             ("file:///data/em", "/data/em", "em"),
             ("./em.zarr", "./em.zarr", "em.zarr"),

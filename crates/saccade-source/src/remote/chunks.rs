@@ -42,8 +42,10 @@ impl Revisions {
     pub(super) fn record(&self, change: Change) {
         let mut state = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if change.reason == ChangeReason::Missed || state.recent.len() >= REMEMBERED {
-            state.recent.clear();
-            state.base = state.base.max(change.revision);
+            // Also of those that are forgotten: no address that a cache may know comes back.
+            let forgotten = state.recent.drain(..).map(|(_, revision)| revision);
+            let newest = forgotten.fold(change.revision, u64::max);
+            state.base = state.base.max(newest);
         } else {
             state.recent.push((change.voxels, change.revision));
         }
@@ -197,6 +199,9 @@ mod tests {
             revisions.record(change(7, n, ChangeReason::Transform));
             assert_eq!(revisions.of(at(7)), n);
         }
+        // A server that has started again counts from where it likes.
+        revisions.record(change(7, 12, ChangeReason::Missed));
+        assert_eq!(revisions.of(at(7)), 1_999);
         let kept = revisions.0.lock().unwrap().recent.len();
         assert!(kept <= REMEMBERED, "{kept} changes are kept");
     }

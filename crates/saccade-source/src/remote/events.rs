@@ -123,7 +123,7 @@ impl Follower {
             return None;
         }
         // A server that continued where the last connection ended would go on with the next.
-        let lost = at.fresh && change.revision > at.revision + 1;
+        let lost = at.fresh && change.revision > at.revision.saturating_add(1);
         Some(if lost {
             self.missed(change.revision)
         } else {
@@ -153,4 +153,60 @@ impl std::fmt::Display for Chained<'_> {
         }
         Ok(())
     }
+}
+
+/// A stream of events, and the same in pieces: what it tells does not depend on them, revisions only rise, and what was told
+/// is not told as anything else when the connection is opened anew.
+#[cfg(all(any(test, fuzzing), not(target_family = "wasm")))]
+pub(super) fn fuzz(bytes: &[u8], pieces: &[&[u8]], client: &Client) {
+    use futures::FutureExt as _;
+
+    const FIRST: u64 = 3;
+    let whole = VoxelBox::of_size(glam::UVec3::new(64, 48, 9));
+    let told = |pieces: &[&[u8]], connections: usize| {
+        let follower = Follower {
+            client: client.clone(),
+            url: Url::parse("http://localhost/v/a").expect("an address"),
+            options: RemoteOptions::default(),
+            changes: Changes::new(whole, FIRST),
+            revisions: Arc::new(Revisions::new(FIRST)),
+            whole,
+        };
+        let mut changes = follower.changes.stream();
+        let mut at = Position {
+            revision: FIRST,
+            fresh: true,
+            wait: Duration::ZERO,
+        };
+        let (mut told, mut retry) = (Vec::new(), None);
+        for _ in 0..connections {
+            at.fresh = true;
+            let mut parser = EventParser::default();
+            for event in pieces.iter().flat_map(|piece| parser.feed(piece)) {
+                // What is no text takes three bytes for each of its own.
+                assert!(event.data.len() + event.kind.len() <= 3 * bytes.len());
+                let before = (at.revision, follower.revisions.of(whole));
+                follower.pass_on(&event, &mut at);
+                let now = (at.revision, follower.revisions.of(whole));
+                assert!(
+                    now.0 >= before.0 && now.1 >= before.1,
+                    "{before:?}, then {now:?}"
+                );
+                while let Some(Some(change)) = changes.next().now_or_never() {
+                    let newest = follower.revisions.of(change.voxels);
+                    let seen = change.voxels.is_empty() || newest >= change.revision;
+                    assert!(seen, "a read would get what was before {change:?}");
+                    told.push(change);
+                }
+            }
+            retry = parser.retry_ms();
+        }
+        (told, at.revision, retry)
+    };
+    let once = told(&[bytes], 1);
+    assert_eq!(once, told(pieces, 1), "in pieces");
+    assert!({ once.0.iter() }.all(|change| (FIRST..=once.1).contains(&change.revision)));
+    let (twice, ..) = told(&[bytes], 2);
+    let known = |change: &Change| change.reason == ChangeReason::Missed || once.0.contains(change);
+    assert!(twice.iter().all(known), "{twice:?}");
 }

@@ -10,8 +10,8 @@ use crate::maybe_send::sleep;
 const ATTEMPTS: u32 = 5;
 
 #[derive(Deserialize)]
-struct ChangesJson {
-    changes: Option<Vec<Change>>,
+pub(super) struct ChangesJson {
+    pub(super) changes: Option<Vec<Change>>,
 }
 
 impl RemoteSource {

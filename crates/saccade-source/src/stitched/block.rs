@@ -205,7 +205,10 @@ impl Block {
         let mut table = bytes.clone();
         let mut number = || table.try_get_u32_le().ok();
         let size = UVec3::new(number()?, number()?, number()?);
-        let entries = usize::try_from(size.as_u64vec3().element_product()).ok()?;
+        let axes = size.as_usizevec3().to_array();
+        let entries = axes
+            .iter()
+            .try_fold(1_usize, |n, axis| n.checked_mul(*axis))?;
         let mut voxels = bytes.slice(entries.checked_mul(8)?.checked_add(12)?.min(bytes.len())..);
         let mut chunks = Vec::new();
         for _ in 0..entries {
@@ -213,12 +216,14 @@ impl Block {
             let min = table.try_get_u16_le().ok()?;
             let max = table.try_get_u16_le().ok()?;
             chunks.push(match length {
-                0 => CutChunk::Empty,
+                0 if (min, max) == (0, 0) => CutChunk::Empty,
+                0 => return None,
                 _ if length > voxels.len() => return None,
                 _ => CutChunk::Voxels(voxels.split_to(length), ValueRange { min, max }),
             });
         }
-        Some(Self {
+        let is_whole = voxels.is_empty() && !chunks.is_empty();
+        is_whole.then_some(Self {
             size,
             chunks,
             until: None,
@@ -239,6 +244,35 @@ impl Block {
         let chunks = self.chunks.len() * size_of::<CutChunk>() + size_of::<Self>() + 64;
         (voxels.sum::<usize>() + chunks) as u64
     }
+}
+
+/// What lies in the cache on disk as a block: it is one, or it is built anew.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    let bytes = Bytes::copy_from_slice(bytes);
+    let Some(block) = Block::from_bytes(&bytes) else {
+        return;
+    };
+    assert_eq!(
+        block.to_bytes(),
+        Some(bytes.clone()),
+        "it is written as it was"
+    );
+    let size = block.size.as_usizevec3();
+    assert_eq!(block.chunks.len(), size.element_product());
+    // Of each chunk there are eight bytes.
+    let most = bytes.len() * (1 + size_of::<CutChunk>() / 8) + 256;
+    assert!(block.memory() <= most as u64);
+    let inside = [UVec3::ZERO, block.size / 2, block.size - 1];
+    let voxels = inside.map(|at| match block.chunk(at) {
+        CutChunk::Voxels(voxels, _) => voxels.len(),
+        CutChunk::Empty | CutChunk::Failed(_) => 0,
+    });
+    assert!(voxels.iter().all(|len| *len <= bytes.len()));
+    assert!(
+        Block::from_bytes(&bytes.slice(..bytes.len() - 1)).is_none(),
+        "it is cut"
+    );
 }
 
 /// The chunk whose first voxel is `min` \[voxels of the block\].

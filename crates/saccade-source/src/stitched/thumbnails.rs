@@ -11,7 +11,7 @@
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use glam::UVec2;
-use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_VOXELS};
+use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_core::volume::Dtype;
 
 use super::tiles::Fetched;
@@ -85,12 +85,55 @@ impl Thumbnail {
     pub(super) fn from_bytes(mut bytes: Bytes, dtype: Dtype) -> Option<Self> {
         let size = UVec2::new(bytes.try_get_u32_le().ok()?, bytes.try_get_u32_le().ok()?);
         let (min, max) = (bytes.try_get_u16_le().ok()?, bytes.try_get_u16_le().ok()?);
+        let most = match dtype {
+            Dtype::Uint8 => u16::from(u8::MAX),
+            _ => u16::MAX,
+        };
+        let can_be = size.min_element() > 0
+            && size.max_element() <= SUB_TILE_EDGE
+            && min <= max
+            && max <= most;
+        if !can_be {
+            return None;
+        }
         let voxels = if min == max {
             0
         } else {
             SUB_TILE_VOXELS * dtype.bytes()
         };
         (bytes.len() == voxels).then(|| Self::new(size, (min, max), bytes))
+    }
+}
+
+/// What lies in the cache on disk as a thumbnail: its head, and what its voxels are filled with.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    let (head, value) = bytes.split_at(bytes.len().min(12));
+    for dtype in [Dtype::Uint8, Dtype::Uint16] {
+        for fill in [0, SUB_TILE_VOXELS * dtype.bytes()] {
+            let filled = value.iter().copied().cycle().take(fill);
+            let bytes: Bytes = head.iter().copied().chain(filled).collect();
+            let Some(thumbnail) = Thumbnail::from_bytes(bytes.clone(), dtype) else {
+                continue;
+            };
+            assert_eq!(thumbnail.to_bytes(), bytes);
+            // All pixels lie in the one sub-tile that there is.
+            let PyramidLevel { width, height, .. } = thumbnail.level();
+            assert!((1..=SUB_TILE_EDGE).contains(&width) && (1..=SUB_TILE_EDGE).contains(&height));
+            assert!(thumbnail.range().is_none_or(|(min, max)| min <= max));
+            assert_eq!(thumbnail.range().is_none(), thumbnail.is_blank());
+            for (_, fetched) in thumbnail.fetched(&[UVec2::ZERO], true) {
+                match fetched {
+                    Fetched::Constant(value) => {
+                        assert_eq!((value, value), (thumbnail.min, thumbnail.max))
+                    }
+                    Fetched::Decoded(voxels) => {
+                        assert_eq!(voxels.len(), SUB_TILE_VOXELS * dtype.bytes())
+                    }
+                    _ => panic!("its voxels are there"),
+                }
+            }
+        }
     }
 }
 
