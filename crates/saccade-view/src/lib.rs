@@ -34,6 +34,8 @@ mod acquisition;
 mod app;
 mod detail;
 mod facts;
+#[cfg(all(test, not(target_family = "wasm")))]
+mod fuzz_targets;
 mod glyphs;
 mod handover;
 mod navigate;
