@@ -1,5 +1,6 @@
 //! What file names mean.
 
+use std::collections::HashSet;
 use std::fmt;
 use std::str::FromStr;
 
@@ -186,13 +187,24 @@ struct Stuck<'a> {
 
 /// What a name says goes to `place`; if it does not fit, how far it does.
 fn fit<'a>(pieces: &'a [Piece], name: &'a str, place: &mut Place) -> Result<(), Stuck<'a>> {
+    fit_on(pieces, name, place, &mut HashSet::new())
+}
+
+/// Like [`fit`], of the rest of a name; `tried` holds how much was left of pieces and name where these did not fit: of many
+/// fields each may end in many places, and all ways to the same rest end alike.
+fn fit_on<'a>(
+    pieces: &'a [Piece],
+    name: &'a str,
+    place: &mut Place,
+    tried: &mut HashSet<(usize, usize)>,
+) -> Result<(), Stuck<'a>> {
     let stuck = |wanted| Err(Stuck { rest: name, wanted });
     let Some((piece, after)) = pieces.split_first() else {
         return if name.is_empty() { Ok(()) } else { stuck(None) };
     };
     match piece {
         Piece::Text(text) => match name.strip_prefix(text.as_str()) {
-            Some(rest) => fit(after, rest, place),
+            Some(rest) => fit_on(after, rest, place, tried),
             None => stuck(Some(piece)),
         },
         Piece::Number(field) => {
@@ -207,12 +219,16 @@ fn fit<'a>(pieces: &'a [Piece], name: &'a str, place: &mut Place) -> Result<(), 
                 Field::Column => &mut place.column,
             };
             *slot = number;
-            fit(after, rest, place)
+            fit_on(after, rest, place, tried)
         }
         Piece::Channel | Piece::Anything => {
             // What follows is text or the end: two names beside each other are refused.
             let ends: Vec<usize> = match after.first() {
-                Some(Piece::Text(text)) => name.match_indices(text.as_str()).map(|m| m.0).collect(),
+                // Also where one begins within another.
+                Some(Piece::Text(text)) => { name.char_indices() }
+                    .map(|(at, _)| at)
+                    .filter(|at| name[*at..].starts_with(text.as_str()))
+                    .collect(),
                 _ => vec![name.len()],
             };
             let mut farthest = Stuck {
@@ -227,17 +243,25 @@ fn fit<'a>(pieces: &'a [Piece], name: &'a str, place: &mut Place) -> Result<(), 
                 if end == 0 && *piece == Piece::Channel {
                     continue;
                 }
+                let left = (after.len(), name.len() - end);
+                if tried.contains(&left) {
+                    continue;
+                }
                 let mut told = place.clone();
                 if *piece == Piece::Channel {
                     told.channel = Some(name[..end].to_owned());
                 }
-                match fit(after, &name[end..], &mut told) {
+                match fit_on(after, &name[end..], &mut told, tried) {
                     Ok(()) => {
                         *place = told;
                         return Ok(());
                     }
-                    Err(stuck) if stuck.rest.len() < farthest.rest.len() => farthest = stuck,
-                    Err(_) => {}
+                    Err(stuck) => {
+                        tried.insert(left);
+                        if stuck.rest.len() < farthest.rest.len() {
+                            farthest = stuck;
+                        }
+                    }
                 }
             }
             Err(farthest)

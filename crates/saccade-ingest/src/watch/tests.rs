@@ -17,6 +17,24 @@ fn pattern(text: &str) -> Pattern {
     pattern
 }
 
+/// What follows a field may begin within what looks like it, and what many fields can end in is not gone through for each.
+#[test]
+fn all_ways_in_which_a_name_fits_are_tried_and_each_once() {
+    let overlapping = pattern("{}_0_{row}.tif{section}");
+    let place = overlapping.file("x_0_0_5.tif1", &Place::default());
+    assert_eq!(place.map(|place| place.row), Some(5));
+    let fields = "{}a".repeat(40);
+    let many = pattern(&format!("{fields}{{section}}"));
+    let name = "a".repeat(250);
+    let before = std::time::Instant::now();
+    assert_eq!(many.file(&format!("{name}x"), &Place::default()), None);
+    let place = many.file(&format!("{name}7"), &Place::default());
+    assert_eq!(place.map(|place| place.section), Some(7));
+    assert!(before.elapsed().as_secs() < 5);
+    let why = many.mismatch(&format!("{name}x"), false);
+    assert!(why.is_some_and(|why| why.contains("a number for {section}")));
+}
+
 #[test]
 fn names_say_where() {
     let place = |section, row, column, channel: Option<&str>| Place {
