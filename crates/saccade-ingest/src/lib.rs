@@ -28,6 +28,8 @@
 )]
 
 mod cancel;
+#[cfg(any(test, fuzzing))]
+pub mod fuzz_targets;
 mod held_up;
 pub mod ingest;
 mod progress;

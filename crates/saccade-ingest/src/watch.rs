@@ -55,6 +55,8 @@ pub use listed::{ListConfig, ListError, ListWatch, Until, follow, kept_list};
 pub use pattern::{Pattern, PatternError, Place};
 pub use scan::{Counts, Disk, Entry, Folders, Found, Next, Scanner};
 pub use stamp::Stamp;
+#[cfg(any(test, fuzzing))]
+pub(crate) use stamps::fuzz as fuzz_stamps;
 
 /// How a folder is watched.
 #[derive(Clone, Debug, PartialEq)]

@@ -81,6 +81,37 @@ impl Stamps {
     }
 }
 
+/// What an earlier process, or anybody, left: whole entries are read, half a one is not, and what is added comes behind.
+#[cfg(any(test, fuzzing))]
+pub(crate) fn fuzz(bytes: &[u8]) {
+    use crate::fuzz_targets::scratch::Scratch;
+
+    let scratch = Scratch::new("stamps");
+    scratch.write(FILE, bytes);
+    let mut stamps = Stamps::new(scratch.path());
+    let all = |stamps: &Stamps| {
+        let mut all = Vec::new();
+        stamps.each(|key, seen| all.push((key, seen)));
+        all
+    };
+    let before = all(&stamps);
+    assert_eq!(before.len(), bytes.len() / ENTRY);
+    for ((key, seen), entry) in before.iter().zip(bytes.chunks(ENTRY)) {
+        assert_eq!(
+            [seen.to_bits(), *key].map(u64::to_le_bytes).as_flattened(),
+            entry
+        );
+    }
+    let added = [
+        (7, Seen::from_bits(3)),
+        (u64::MAX, Seen::from_bits(u64::MAX)),
+    ];
+    stamps.add(&added);
+    assert_eq!(all(&stamps), [before, added.to_vec()].concat());
+    stamps.forget();
+    assert_eq!(all(&stamps), []);
+}
+
 #[cfg(test)]
 mod tests {
     use std::time::SystemTime;

@@ -16,6 +16,8 @@ use super::{BoxError, Stack, StackError, StackInfo, check_inside, files};
 
 /// Decoded chunks kept \[bytes\]: those of one section, mostly, are needed for the next one.
 const CACHE_BYTES: u64 = 512 << 20;
+/// Largest chunk, or shard of chunks, decoded \[bytes\].
+const LARGEST_CHUNK: u64 = 1 << 30;
 
 /// Which 16-bit values become the darkest and the brightest 8-bit ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -116,6 +118,14 @@ impl ZarrStack {
         let side = |n: u64| u32::try_from(n).ok().filter(|n| *n > 0);
         let extent = side(x).zip(side(y)).zip(side(z));
         let ((x, y), z) = extent.ok_or_else(|| wrong("an axis is empty, or far too long"))?;
+        // Chunks are decoded whole, and those that are not there are as large.
+        let chunk = array.chunk_shape(&vec![0; shape.len()]);
+        let chunk = chunk.map_err(|e| failed(e.into()))?;
+        let voxel = if window.is_some() { 2 } else { 1 };
+        let bytes = { chunk.iter() }.try_fold(voxel, |n: u64, edge| n.checked_mul(edge.get()));
+        if bytes.is_none_or(|bytes| bytes > LARGEST_CHUNK) {
+            return Err(wrong("its chunks are of more than 1 GiB"));
+        }
         let info = StackInfo {
             name: files::volume_name(path),
             extent: UVec3::new(x, y, z),
