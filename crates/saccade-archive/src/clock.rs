@@ -1,5 +1,7 @@
 //! Time: the machine's, or one that tests turn.
 
+pub mod conformance;
+
 use std::fmt::Debug;
 use std::sync::LazyLock;
 use std::time::{Duration, Instant, SystemTime};

@@ -1,5 +1,7 @@
 //! Numbers that nobody can foresee: the machine's, or those of a seed.
 
+pub mod conformance;
+
 use std::fmt::Debug;
 use std::hash::{BuildHasher, DefaultHasher, Hasher, RandomState};
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -17,6 +17,7 @@ mod memory;
 mod name;
 mod object;
 
+pub use disk::conformance as disk_conformance;
 pub use disk::{
     Crash, DirEntry, Disk, FolderId, Metadata, OpenFile, SimulatedDisk, SystemDisk, write_whole,
 };

@@ -10,6 +10,7 @@ use std::time::SystemTime;
 
 use bytes::Bytes;
 
+pub mod conformance;
 mod folder_id;
 mod regular;
 mod rename_new;

@@ -237,6 +237,10 @@ impl State {
         {
             return Err(io::ErrorKind::IsADirectory.into());
         }
+        // Two names of one file, or the same name twice: nothing happens.
+        if self.lookup(new_folder, &new_name)? == Some(node) {
+            return Ok(());
+        }
         self.change(new_folder, new_name, Some(node));
         self.change(old_folder, old_name, None);
         Ok(())
