@@ -67,7 +67,7 @@ pub fn changed(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
     for _ in 0..=random.below(6) {
         let at = random.below(bytes.len());
         match random.below(7) {
-            0 | 1 if !bytes.is_empty() => bytes[at] = random.next() as u8,
+            0 | 1 if !bytes.is_empty() => bytes[at] = random.next().to_le_bytes()[0],
             2 if !bytes.is_empty() => bytes[at] ^= 1 << random.below(8),
             3 => {
                 let end = (at + random.below(16)).min(bytes.len());

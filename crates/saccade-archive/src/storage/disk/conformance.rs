@@ -263,6 +263,7 @@ mod tests {
         MakesFolders,
         RenameLeaves,
         RenameLosesItself,
+        RenameNewReplaces,
         RemovesLocked,
         IgnoresRanges,
         ListsFilesAsFolders,
@@ -311,6 +312,13 @@ mod tests {
                 write(&self.disk, from, &bytes);
             }
             Ok(())
+        }
+
+        fn rename_new(&self, from: &Path, to: &Path) -> io::Result<()> {
+            match self.has(Fault::RenameNewReplaces) {
+                true => self.disk.rename(from, to),
+                false => self.disk.rename_new(from, to),
+            }
         }
 
         fn remove_file(&self, path: &Path) -> io::Result<()> {
@@ -380,6 +388,7 @@ mod tests {
             Fault::MakesFolders,
             Fault::RenameLeaves,
             Fault::RenameLosesItself,
+            Fault::RenameNewReplaces,
             Fault::RemovesLocked,
             Fault::IgnoresRanges,
             Fault::ListsFilesAsFolders,
