@@ -8,6 +8,7 @@ use saccade_archive::storage::MemoryStorage;
 use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
+use super::changes::Wrong;
 use super::fixture::{Fixture, Levels, difference, expected_as, read_all, read_channel, tile};
 use super::oracle::How;
 use super::run;
@@ -291,5 +292,24 @@ fn a_channel_that_comes_late_takes_the_place_of_what_filled_it() {
                 before = after;
             }
         }
+    });
+}
+
+/// Negative control: a source that tells only where what changed lies changes elsewhere as well.
+#[test]
+fn what_is_filled_and_not_told_is_found() {
+    run(async {
+        let mut fixture = alternating().await;
+        let source = open(&fixture, Gaps::Nearest(1)).await;
+        source.go_wrong(Some(Wrong::Filled));
+        let mut changes = source.changes();
+        let before = read_channel(&source, 1).await;
+        put_of(&mut fixture, 9, 1, (90, 70)).await;
+        let told = changes.next().await.unwrap().voxels;
+        let after = read_channel(&source, 1).await;
+        let pairs = before[0].iter().zip(&after[0]);
+        let all = VoxelBox::of_size(fixture.volume.extent()).iter().zip(pairs);
+        let untold = all.filter(|(voxel, (a, b))| a != b && !told.contains(*voxel));
+        assert!(untold.count() > 1000);
     });
 }
