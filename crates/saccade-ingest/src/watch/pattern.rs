@@ -91,7 +91,7 @@ impl Pattern {
     }
 
     /// The channel that a path says, by its last parts; or why it fits no part of this.
-    pub(super) fn channel(&self, path: &str) -> Result<String, String> {
+    pub(crate) fn channel(&self, path: &str) -> Result<String, String> {
         let names: Vec<&str> = { path.split(['/', '\\']) }
             .filter(|name| !name.is_empty())
             .collect();
@@ -118,7 +118,7 @@ impl Pattern {
     }
 
     /// Whether a name can hardly be but that of such a folder: it is as the pattern spells it, or has its numbers.
-    pub(super) fn is_a_folder(&self, depth: usize, name: &str) -> bool {
+    pub(crate) fn is_a_folder(&self, depth: usize, name: &str) -> bool {
         let Some(part) = self.parts.get(depth).filter(|_| depth < self.depth()) else {
             return false;
         };
