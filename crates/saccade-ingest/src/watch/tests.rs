@@ -26,11 +26,10 @@ fn all_ways_in_which_a_name_fits_are_tried_and_each_once() {
     let fields = "{}a".repeat(40);
     let many = pattern(&format!("{fields}{{section}}"));
     let name = "a".repeat(250);
-    let before = std::time::Instant::now();
+    // One by one, it would be no end of them.
     assert_eq!(many.file(&format!("{name}x"), &Place::default()), None);
     let place = many.file(&format!("{name}7"), &Place::default());
     assert_eq!(place.map(|place| place.section), Some(7));
-    assert!(before.elapsed().as_secs() < 5);
     let why = many.mismatch(&format!("{name}x"), false);
     assert!(why.is_some_and(|why| why.contains("a number for {section}")));
 }
