@@ -164,6 +164,12 @@ fn tiff_stack(bytes: &[u8]) {
 
 /// An OME-Zarr as a stack: its group, its array and a chunk, with a record separator (0x1e) between them.
 fn zarr_stack(bytes: &[u8]) {
+    // What the library panics of is caught there, and told as an error; libFuzzer ends with any panic unless it is asked not to.
+    #[cfg(fuzzing)]
+    {
+        static QUIET: std::sync::Once = std::sync::Once::new();
+        QUIET.call_once(|| drop(std::panic::take_hook()));
+    }
     let mut parts = bytes.splitn(3, |b| *b == 0x1e);
     let mut part = || parts.next().unwrap_or_default();
     let (group, array, chunk) = (part(), part(), part());

@@ -1,6 +1,7 @@
 //! OME-Zarr, versions 0.4 and 0.5, as a stack: its finest level.
 
 use std::fs;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -158,7 +159,7 @@ impl Stack for ZarrStack {
             range(min.x, size.x),
         ]);
         let options = CodecOptions::default();
-        let voxels = match self.window {
+        let read = || match self.window {
             None => self
                 .cache
                 .retrieve_array_subset::<Vec<u8>>(&subset, &options),
@@ -176,7 +177,11 @@ impl Stack for ZarrStack {
             source,
             path: self.path.clone(),
         };
-        let voxels = voxels.map_err(|e| failed(e.into()))?;
+        // The library panics where the index of a shard leads out of what can be counted.
+        let voxels = match catch_unwind(AssertUnwindSafe(read)) {
+            Ok(read) => read.map_err(|e| failed(e.into()))?,
+            Err(_) => return Err(failed("a chunk of it is damaged".into())),
+        };
         Ok(GrayImage::new(size.x, size.y, voxels))
     }
 }
