@@ -2,6 +2,9 @@
 
 use saccade_ingest::Cancel;
 
+/// How a program ends that was to do something to its end, and was interrupted.
+pub(crate) const INTERRUPTED: u8 = 130;
+
 /// Returns when the user wants the program to end.
 pub(crate) async fn interrupted() {
     tokio::select! {
@@ -18,7 +21,7 @@ pub(crate) fn cancel_when_interrupted() -> Cancel {
         interrupted().await;
         uttered.cancel();
         interrupted().await;
-        std::process::exit(130);
+        std::process::exit(INTERRUPTED.into());
     });
     cancel
 }

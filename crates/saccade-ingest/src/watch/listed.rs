@@ -282,8 +282,8 @@ impl<F: Folders> ListWatch<F> {
             let there = names(file).find_map(|name| odd.get(&*name).copied());
             let Some(path) = there.or_else(|| self.index.folder(file)) else {
                 if examples.len() < SHOWN {
-                    let not_taken = self.index.not_taken(file);
-                    let why = not_taken.map_or_else(String::new, |why| format!(" ({why})"));
+                    let why = self.not_taken(file);
+                    let why = why.map_or_else(String::new, |why| format!(" ({why})"));
                     examples.push(format!("{file:?}{why}"));
                 }
                 if absent < MOST_ASKED && blocked.is_none() {
@@ -323,6 +323,21 @@ impl<F: Folders> ListWatch<F> {
         said.extend(self.unclear());
         said.extend(self.unfit.clone());
         (!said.is_empty()).then(|| said.join("; "))
+    }
+
+    /// Why an image that has the name of one that is missing is not taken for it, in words; nothing, if it is another one's.
+    fn not_taken(&self, file: &str) -> Option<String> {
+        let (path, why) = self.index.not_taken(file)?;
+        let called = path.to_str()?;
+        let mut named = self.by_name.get(&key(base(called)))?.iter();
+        let is_anothers = named.any(|tile| {
+            let wanted = self.tiles.get(tile).and_then(|tile| tile.wanted.as_ref());
+            wanted.is_some_and(|Wanted { file, .. }| {
+                let sought = || self.index.sought(file);
+                self.index.may_be(called, file) && sought() == Sought::There(path.clone())
+            })
+        });
+        (!is_anothers).then_some(why)
     }
 
     /// Which images are in several folders, in words.

@@ -17,13 +17,10 @@ use saccade_source::images::ImageOptions;
 use saccade_source::objects::ObjectError;
 
 use crate::arguments::CatalogArgument;
-use crate::interrupt::interrupted;
+use crate::interrupt::{INTERRUPTED, interrupted};
 use crate::open::{Opened, Place};
 use crate::report::say;
 use crate::stitching::Stitching;
-
-/// Status with which an export ends that was told to end before it was whole, as of a program that a signal ends.
-const INTERRUPTED: u8 = 130;
 
 /// A list of channels, in one argument.
 #[derive(Clone)]

@@ -19,7 +19,7 @@ use tokio::task::JoinHandle;
 use super::followed::{Bare, Followed, is_being_written};
 use crate::arguments::{Archive, volume_name};
 use crate::folders::overlap;
-use crate::interrupt::cancel_when_interrupted;
+use crate::interrupt::{INTERRUPTED, cancel_when_interrupted};
 use crate::open::waited_for;
 use crate::progress::Shown;
 use crate::report::say;
@@ -304,6 +304,15 @@ impl Ingest {
         Ok(())
     }
 
+    /// How it ends when it is interrupted: who follows ends only so; of who looks once, something may be left.
+    fn interrupted(&self) -> ExitCode {
+        if !self.once {
+            return ExitCode::SUCCESS;
+        }
+        say("interrupted; the same command takes in what is left");
+        ExitCode::from(INTERRUPTED)
+    }
+
     /// What to follow; `None` if that was cancelled. What says it may be about to be written: it is read again, unless all
     /// is said to be there.
     async fn followed(
@@ -364,12 +373,12 @@ impl Ingest {
             self.wait_for_what_is_away(&location, &name, kept, &cancel)
                 .await?;
             if cancel.is_cancelled() {
-                return Ok(ExitCode::SUCCESS);
+                return Ok(self.interrupted());
             }
         }
         let followed = self.followed(&name, kept.as_deref(), &cancel).await?;
         let Some(followed) = followed else {
-            return Ok(ExitCode::SUCCESS);
+            return Ok(self.interrupted());
         };
         if let Some(folder) = location.folder() {
             refuse_same_folder(&self.acquisition, folder)?;
@@ -377,7 +386,7 @@ impl Ingest {
         let opened = waited_for(|| VisualizationArchive::create(&location));
         let archive = tokio::select! {
             archive = opened => archive?,
-            () = cancel.cancelled() => return Ok(ExitCode::SUCCESS),
+            () = cancel.cancelled() => return Ok(self.interrupted()),
         };
         let mut options = IngestOptions {
             volume: self.volume.clone(),
@@ -404,7 +413,7 @@ impl Ingest {
             options.held_up = Some(held_up.clone());
             let begun = self.begin(followed, &kept, &cancel, held_up).await?;
             let Some(begun) = begun.filter(|_| !cancel.is_cancelled()) else {
-                return Ok(ExitCode::SUCCESS);
+                return Ok(self.interrupted());
             };
             options.linked = Some(begun.folder);
             (watching, missing) = (begun.watching, begun.missing);
@@ -427,10 +436,11 @@ impl Ingest {
                 done = taken_in => done,
                 failed = watching => {
                     failed??;
-                    return Ok(ExitCode::SUCCESS);
+                    return Ok(self.interrupted());
                 }
             },
         };
+        let is_interrupted = cancel.is_cancelled();
         cancel.cancel();
         shown.finish();
         let Summary {
@@ -468,6 +478,9 @@ impl Ingest {
             say(&format!(
                 "{missing}; those that are there by then are taken in when it is started again"
             ));
+        }
+        if is_interrupted {
+            return Ok(self.interrupted());
         }
         let all = !self.once || (set_aside == 0 && missing.is_none());
         Ok(if all {

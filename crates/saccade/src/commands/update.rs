@@ -12,14 +12,11 @@ use saccade_archive::catalog::Catalog;
 use saccade_ingest::update::{Line, Summary, apply, read};
 
 use crate::arguments::{Archive, volume_name};
-use crate::interrupt::cancel_when_interrupted;
+use crate::interrupt::{INTERRUPTED, cancel_when_interrupted};
 use crate::report::say;
 
 /// What the command ends with when not all could be applied.
 const NOT_ALL: u8 = 3;
-
-/// What the command ends with when it was interrupted.
-const INTERRUPTED: u8 = 130;
 
 /// Move or delete tiles of a volume: what registration found, or what should not be seen. Views that are open show it.
 /// Ends with 3 if some lines could not be applied.

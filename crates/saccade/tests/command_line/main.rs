@@ -13,6 +13,7 @@ mod failing_volume;
 #[cfg(target_os = "linux")]
 mod full_disk;
 mod images;
+mod interrupted;
 mod kills;
 mod kills_of_changes;
 mod labels;

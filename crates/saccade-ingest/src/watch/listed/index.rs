@@ -222,16 +222,17 @@ impl Index {
         blocked(file).or_else(|| blocked(&decoded(file)?))
     }
 
-    /// Of what is missing: which image is called so and is not taken for it, and why, in words.
-    pub(super) fn not_taken(&self, file: &str) -> Option<String> {
+    /// Of what is missing: an image that is called so and is not taken for it, and why, in words.
+    pub(super) fn not_taken(&self, file: &str) -> Option<(PathBuf, String)> {
         let (path, why) = self.seeker().not_taken(file)?;
-        Some(match why {
+        let why = match why {
             NotTaken::AsAnother => format!(
                 "{path:?} fits other images of the list as well; name it with its folders there"
             ),
             NotTaken::Elsewhere => format!("{path:?} is not in the folder that the list names"),
             NotTaken::Channel => format!("{path:?} is of another channel, as paths say"),
-        })
+        };
+        Some((path, why))
     }
 
     /// Looks again at some of what is nothing to read: links may lead to something later.
