@@ -1,8 +1,8 @@
 //! Which image a list means: lists name folders of other machines, or none.
 //!
 //! [`Seeker`] finds it among [`Files`], which are those [below a folder](Images) as it lies, or what a watch knows of one. What else the
-//! list [`Mentions`] tells whether an image that lies elsewhere can be another one's. All three speak of paths by their
-//! [ends](paths), since those are what two machines have in common.
+//! list [`Mentions`] tells whether an image that lies elsewhere can be another one's. All three speak of paths by their ends,
+//! since those are what two machines have in common.
 
 pub mod conformance;
 mod ends;

@@ -96,7 +96,7 @@ impl Sections {
 /// Where the tiles of a volume lie \[000 §5.1\].
 ///
 /// Knows from the start which sections have tiles, and of which channels, and loads a section's when it is first asked for.
-/// From then on [`Self::apply`] keeps it as the catalog has it, until others need its memory.
+/// From then on `apply` keeps it as the catalog has it, until others need its memory.
 pub struct TileIndex {
     catalog: Catalog,
     volume: Box<str>,
