@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::errors::text;
 use super::kills::{Killer, image, tree};
-use super::{done, run, simulate, stderr};
+use super::{done, simulate, stderr};
 
 /// The tiles of the catalog.
 fn tiles(archive: &Path) -> Vec<Tile> {
@@ -35,14 +35,14 @@ fn place(tile: &Tile) -> DVec2 {
     DVec2::new(x, y)
 }
 
-/// The finest level. In coarser ones voxels may be equally near two centres, of which the tile counts that came first.
+/// Voxels of the finest level, without its description, which says the revision. In coarser ones voxels may be equally near two centres, of which the tile counts that came first.
 pub(super) fn exported(archive: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let out = archive.with_extension("zarr");
     done(["export", text(archive), text(&out)]);
     let mut files = image(tree(&out));
     fs::remove_dir_all(out).unwrap();
-    files.retain(|file, _| file.starts_with("0"));
-    assert!(files.len() > 1, "{:?}", files.keys());
+    files.retain(|file, _| file.starts_with("0/c"));
+    assert!(!files.is_empty(), "no voxels are exported");
     files
 }
 
@@ -158,29 +158,19 @@ fn a_killed_repair_makes_nothing_worse_and_goes_on() {
     ];
     let mut kept = damage();
     let mut killer = Killer::new(0x5acc_0005);
-    let (mut there, mut in_the_middle) = (pyramids().len(), 0);
-    while killer.goes_on(in_the_middle) {
+    while killer.goes_on(1) {
         let killed = killer.life(&repair);
-        let left = run(["check", text(&archive), "--acquisition", text(&acquisition)]);
         let all = pyramids();
         assert!(
             kept.iter().all(|pyramid| all.contains(pyramid)),
             "a pyramid that was whole is gone"
         );
-        let some = left.status.code() == Some(3) && all.len() != there;
-        in_the_middle += u32::from(killed && some);
-        if killed && all.len() == there {
-            killer.was_early();
-        }
-        there = all.len();
         if !killed {
             done(ingest);
             assert!(exported(&archive) == want, "other voxels");
             kept = damage();
-            there = pyramids().len();
         }
     }
-    assert!(in_the_middle > 0, "no kill came while it worked");
     done(repair);
     done(ingest);
     let whole = stderr(&done([
