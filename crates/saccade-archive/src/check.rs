@@ -14,7 +14,7 @@ use saccade_core::volume::Dtype;
 
 use crate::VisualizationArchive;
 use crate::acquisition::Cursor;
-use crate::catalog::{CatalogError, History, Naming, Tile, VolumeEntry, place};
+use crate::catalog::{CatalogError, History, Naming, Placing, Tile, TileId, VolumeEntry, place};
 use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
 use crate::storage::{Entry, StorageError};
@@ -157,7 +157,7 @@ pub async fn check(
         lacking: HashSet::new(),
         doubtful: HashSet::new(),
         unread: HashSet::new(),
-        elsewhere: Vec::new(),
+        placings: None,
         of_other_types: Vec::new(),
         of_its_type: 0,
         objects: &objects,
@@ -222,8 +222,8 @@ struct Check<'a> {
     doubtful: HashSet<String>,
     /// Volumes of which it is not known how far their records were read.
     unread: HashSet<String>,
-    /// Tiles of the section at hand that lie where their newest record does not say.
-    elsewhere: Vec<(Tile, records::Said)>,
+    /// What brought the tiles of a section to where they lie, once that is wanted.
+    placings: Option<(u32, HashMap<TileId, Placing>)>,
     /// Tiles of the volume at hand whose voxels are of another type than the volume's.
     of_other_types: Vec<(Tile, Dtype)>,
     /// How many tiles of the volume at hand are of its type.
@@ -252,6 +252,7 @@ impl Check<'_> {
         // Not those that are counted: what the counts leave out would be called nobody's.
         let sections = catalog.sections_of_tiles(&volume.name).await?;
         for &z in &sections {
+            self.placings = None;
             let tiles = catalog.section_rows(&volume.name, z).await?;
             let looks = tiles.into_iter().map(async |tile| match tile {
                 Ok(tile) => {
@@ -269,7 +270,6 @@ impl Check<'_> {
                     Err(spoilt) => self.spoilt(entry, spoilt).await?,
                 }
             }
-            self.moved(entry, z).await?;
             (self.progress)(self.report.tiles, self.total);
         }
         for spoilt in catalog.rows_without_section(&volume.name).await? {
@@ -394,6 +394,8 @@ impl Check<'_> {
         if self.unrecorded(entry, tile).await? {
             return Ok(());
         }
+        let settled = self.settle(entry, tile).await?;
+        let tile = settled.as_ref().unwrap_or(tile);
         if let Some(reason) = self.contradicted(entry, tile) {
             self.named.insert(self.hasher.hash_one(&tile.pyramid));
             return self.mend(FindingKind::Spoilt, entry, tile, reason).await;
@@ -404,8 +406,6 @@ impl Check<'_> {
         let extent = entry.volume.extent();
         if place(extent, tile.section, tile.size, tile.transform).is_none() {
             self.misplaced(entry, tile).await?;
-        } else {
-            self.compare_place(tile);
         }
         if !self.named.insert(self.hasher.hash_one(&tile.pyramid)) {
             // It was looked at with the first of them.

@@ -34,6 +34,9 @@ pub struct Tile {
     pub pyramid: String,
     /// The volume's revision when the tile last changed.
     pub revision: u64,
+    /// Position of the record that brought its image: of two images, the later one's is larger, whoever enters them in which
+    /// order. 0 where the catalog's row says none that can be.
+    pub position: u64,
 }
 
 /// A tile to be entered.

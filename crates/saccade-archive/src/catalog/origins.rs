@@ -44,6 +44,40 @@ pub struct Naming {
     pub has_volume: bool,
 }
 
+/// Asks for [`Placing`]s of a volume's rows.
+macro_rules! placings {
+    ($which:literal) => {
+        concat!(
+            "SELECT t.id AS placed, t.transform_position AS transform_position, t.revision AS placed_at, \
+             coalesce(c.revision, -1) AS revision, coalesce(c.tile, -1) AS tile, \
+             coalesce(c.section, 0) AS section, coalesce(c.x0, 0) AS x0, coalesce(c.y0, 0) AS y0, \
+             coalesce(c.x1, 0) AS x1, coalesce(c.y1, 0) AS y1, coalesce(c.reason, 'tile') AS reason \
+             FROM tiles AS t LEFT JOIN changes AS c \
+             ON c.volume = t.volume AND c.revision = t.revision AND c.tile = t.id \
+             WHERE t.volume = $1 AND ",
+            $which
+        )
+    };
+}
+
+fn placing(row: &Row) -> Result<Option<Placing>, sqlx::Error> {
+    let change = match row.get::<i64>("revision")? {
+        -1 => None,
+        _ => rows::change(row).ok(),
+    };
+    let known = rows::unsigned(row, "transform_position")
+        .and_then(|position| Ok((position, rows::unsigned(row, "placed_at")?)));
+    let Ok((transform_position, revision)) = known else {
+        return Ok(None);
+    };
+    Ok(Some(Placing {
+        tile: TileId(row.get("placed")?),
+        transform_position,
+        revision,
+        change: change.map(|change| change.voxels),
+    }))
+}
+
 impl Catalog {
     /// Rows of the table of tiles after one, by their numbers, some thousand at once: also those that are found by no volume.
     ///
@@ -103,32 +137,27 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn placings(&self, volume: &str, z: u32) -> Result<Vec<Placing>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let question = "SELECT t.id AS placed, t.transform_position AS transform_position, t.revision AS placed_at, \
-                        coalesce(c.revision, -1) AS revision, coalesce(c.tile, -1) AS tile, \
-                        coalesce(c.section, 0) AS section, coalesce(c.x0, 0) AS x0, coalesce(c.y0, 0) AS y0, \
-                        coalesce(c.x1, 0) AS x1, coalesce(c.y1, 0) AS y1, coalesce(c.reason, 'tile') AS reason \
-                        FROM tiles AS t LEFT JOIN changes AS c \
-                        ON c.volume = t.volume AND c.revision = t.revision AND c.tile = t.id \
-                        WHERE t.volume = $1 AND t.section = $2 AND t.deleted = 0";
-        let placing = |row: &Row| {
-            let change = match row.get::<i64>("revision")? {
-                -1 => None,
-                _ => rows::change(row).ok(),
-            };
-            let known = rows::unsigned(row, "transform_position")
-                .and_then(|position| Ok((position, rows::unsigned(row, "placed_at")?)));
-            let Ok((transform_position, revision)) = known else {
-                return Ok(None);
-            };
-            Ok(Some(Placing {
-                tile: TileId(row.get("placed")?),
-                transform_position,
-                revision,
-                change: change.map(|change| change.voxels),
-            }))
-        };
+        let question = placings!("t.section = $2 AND t.deleted = 0");
         let placings = self.ask(question, &[id.into(), z.into()], placing).await?;
         Ok(placings.into_iter().flatten().collect())
+    }
+
+    /// What brought a tile to where its row says that it lies, also if it calls it deleted; `None` where that cannot be
+    /// understood.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn placing(
+        &self,
+        volume: &str,
+        tile: TileId,
+    ) -> Result<Option<Placing>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = placings!("t.id = $2");
+        let values = [id.into(), tile.0.into()];
+        let placings = self.ask(question, &values, placing).await?;
+        Ok(placings.into_iter().flatten().next())
     }
 
     /// The tiles that were entered last, as far as their records tell, at most `most`: names, and positions of records. Looks at

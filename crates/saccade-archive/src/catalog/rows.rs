@@ -125,16 +125,23 @@ pub(super) fn tile_or_spoilt(row: &Row) -> Result<Result<Tile, SpoiltTile>, Erro
         Ok(tile) => return Ok(Ok(tile)),
         Err(error) => error,
     };
-    // Put anywhere, it is one: then only where it lies cannot be.
-    let elsewhere = tile_at(row, SectionFromTile::IDENTITY).ok();
+    let own = pyramid(row);
+    let with = |pyramid: &str, transform| {
+        tile_with(row, pyramid.to_owned(), transform)
+            .ok()
+            .map(Box::new)
+    };
+    let but_for_pyramid = { transform(row).ok() }.and_then(|at| with("none", at));
     Ok(Err(SpoiltTile {
         id: TileId(row.get("id")?),
         name: row.get("name").map_err(|_| legible(row, "name")),
         section: section(row).ok(),
-        pyramid: pyramid(row).map_err(|_| legible(row, "pyramid")),
+        // Put anywhere, it is one: then only where it lies cannot be.
+        but_for_place: { own.as_ref().ok() }.and_then(|own| with(own, SectionFromTile::IDENTITY)),
+        pyramid: own.map_err(|_| legible(row, "pyramid")),
         position: unsigned(row, "position").ok(),
         reason: reason_of(error),
-        size: elsewhere.map(|tile| tile.size),
+        but_for_pyramid,
     }))
 }
 
@@ -152,17 +159,18 @@ pub(super) fn tile_whose_records_are_known(row: &Row) -> Result<Result<Tile, Spo
             pyramid: Ok(tile.pyramid),
             position: unsigned(row, "position").ok(),
             reason: reason_of(error),
-            size: None,
+            but_for_place: None,
+            but_for_pyramid: None,
         })),
         (tile, _) => Ok(tile),
     }
 }
 
 fn tile(row: &Row) -> Result<Tile, Error> {
-    tile_at(row, transform(row)?)
+    tile_with(row, pyramid(row)?, transform(row)?)
 }
 
-fn tile_at(row: &Row, transform: SectionFromTile) -> Result<Tile, Error> {
+fn tile_with(row: &Row, pyramid: String, transform: SectionFromTile) -> Result<Tile, Error> {
     Ok(Tile {
         id: TileId(row.get("id")?),
         name: row.get("name")?,
@@ -170,8 +178,9 @@ fn tile_at(row: &Row, transform: SectionFromTile) -> Result<Tile, Error> {
         channel: small(row, "channel")?,
         size: size(row)?,
         transform,
-        pyramid: pyramid(row)?,
+        pyramid,
         revision: unsigned(row, "revision")?,
+        position: unsigned(row, "position").unwrap_or_default(),
     })
 }
 

@@ -1,7 +1,5 @@
 //! Rows that mean nothing, which no program of ours writes: each is told by name, and keeps nobody from the others.
 
-use glam::UVec2;
-
 use super::database::Row;
 use super::{Catalog, CatalogError, Tile, TileId, VolumeEntry, rows};
 
@@ -15,7 +13,7 @@ pub struct Listed {
 }
 
 /// A tile of which the catalog says what cannot be.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct SpoiltTile {
     /// Its id.
     pub id: TileId,
@@ -29,8 +27,10 @@ pub struct SpoiltTile {
     pub position: Option<u64>,
     /// What cannot be.
     pub reason: String,
-    /// Width and height \[pixels\], if all but its transform is as it can be.
-    pub size: Option<UVec2>,
+    /// As if it lay at the origin, if all but its transform is as it can be.
+    pub but_for_place: Option<Box<Tile>>,
+    /// As if it had a pyramid, if all but the name of that is as it can be.
+    pub but_for_pyramid: Option<Box<Tile>>,
 }
 
 impl Catalog {

@@ -24,7 +24,7 @@ impl Catalog {
     pub async fn section_tiles(&self, volume: &str, z: u32) -> Result<Vec<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
         let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                        pyramid, revision FROM tiles \
+                        pyramid, revision, position FROM tiles \
                         WHERE volume = $1 AND section = $2 AND deleted = 0 ORDER BY id";
         let values = [id.into(), z.into()];
         let rows = self.ask(question, &values, rows::tile_or_spoilt).await?;
@@ -39,7 +39,7 @@ impl Catalog {
     pub async fn tile(&self, volume: &str, name: &str) -> Result<Option<Tile>, CatalogError> {
         let id = self.volume_id(volume).await?;
         let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                        pyramid, revision FROM tiles \
+                        pyramid, revision, position FROM tiles \
                         WHERE volume = $1 AND name = $2 AND deleted = 0";
         let values = [id.into(), name.into()];
         let rows = self.ask(question, &values, rows::tile_or_spoilt).await?;
@@ -75,11 +75,11 @@ impl Catalog {
         let id = self.volume_id(volume).await?;
         let question = Statement {
             sqlite: "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                     pyramid, revision FROM tiles \
+                     pyramid, revision, position FROM tiles \
                      WHERE id IN (SELECT value FROM json_each($1)) AND volume = $2 \
                      AND deleted = 0 ORDER BY id",
             postgres: "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
-                       pyramid, revision FROM tiles \
+                       pyramid, revision, position FROM tiles \
                        WHERE id IN (SELECT value::bigint FROM json_array_elements_text($1::text::json)) \
                        AND volume = $2 AND deleted = 0 ORDER BY id",
         };

@@ -4,7 +4,8 @@ use std::hash::BuildHasher as _;
 
 use super::repair::Source;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
-use crate::catalog::{Tile, VolumeEntry, place};
+use crate::acquisition::Record;
+use crate::catalog::{SpoiltTile, Tile, VolumeEntry, place};
 
 impl Check<'_> {
     /// Finds rows that are said to be deleted and name their pyramid still, as no deletion leaves them. Those whose records say so,
@@ -19,8 +20,31 @@ impl Check<'_> {
             if let Some(pyramid) = pyramid {
                 self.named.insert(self.hasher.hash_one(pyramid));
             }
-            let is_told = name.zip(self.records.as_ref());
-            if is_told.is_some_and(|(name, records)| records.is_deleted(name)) {
+            let id = row.as_ref().map_or_else(|spoilt| spoilt.id, |tile| tile.id);
+            let is_told = { name.zip(self.records.as_ref()) }
+                .is_some_and(|(name, records)| records.is_deleted(name));
+            let is_known = !is_told && self.history.was_deleted(id, 0);
+            if is_told || is_known {
+                let (tile, object) = (name.cloned(), pyramid.cloned());
+                let mut repair = None;
+                if self.options.repair {
+                    let mut commit = self.archive.catalog().begin(volume).await?;
+                    commit.end_nameless(id).await?;
+                    commit.finish().await?;
+                    repair = Some(Repair::TakenAway);
+                }
+                // Records that say so are enough; whoever only looks is told what is left of others.
+                if is_known {
+                    let reason = "it was deleted, as the catalog's changes tell, and its row names a pyramid still".to_owned();
+                    self.report.findings.push(Finding {
+                        kind: FindingKind::Spoilt,
+                        volume: Some(volume.clone()),
+                        tile,
+                        object,
+                        reason,
+                        repair,
+                    });
+                }
                 continue;
             }
             self.report.tiles += 1;
@@ -29,10 +53,28 @@ impl Check<'_> {
             }
             match row {
                 Ok(tile) => self.bring_back(entry, &tile).await?,
-                Err(spoilt) => self.spoilt(entry, spoilt).await?,
+                Err(spoilt) => match self.placed_again(entry, &spoilt) {
+                    Some(tile) => self.bring_back(entry, &tile).await?,
+                    None => self.spoilt(entry, spoilt).await?,
+                },
             }
         }
         Ok(())
+    }
+
+    /// A tile of which only the place cannot be, where its newest record says that it lies.
+    fn placed_again(&self, entry: &VolumeEntry, spoilt: &SpoiltTile) -> Option<Tile> {
+        let tile = spoilt.but_for_place.as_deref()?;
+        let said = self.records.as_ref()?.said(&tile.name)?;
+        let transform = match self.record_at(entry, said.record)?.1 {
+            Record::Tile(record) if record.tile == tile.name => record.transform,
+            Record::Transform(record) if record.tile == tile.name => record.transform,
+            _ => return None,
+        };
+        Some(Tile {
+            transform,
+            ..tile.clone()
+        })
     }
 
     async fn bring_back(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<(), CheckError> {
@@ -40,6 +82,7 @@ impl Check<'_> {
             "the catalog calls it deleted, but names its pyramid still, as no deletion leaves it"
                 .to_owned();
         let looked = self.look(tile).await;
+        let tile = &self.in_its_place(entry, tile, &mut reason).await?;
         let is_placed = place(
             entry.volume.extent(),
             tile.section,
@@ -48,8 +91,9 @@ impl Check<'_> {
         )
         .is_some();
         let is_whole = is_placed && looked.is_ok_and(|(verified, _)| !verified.mistaken);
+        let contradicted = self.contradicted(entry, tile);
         let mut repair = None;
-        if is_whole {
+        if is_whole && contradicted.is_none() {
             if self.options.repair {
                 let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
                 commit.undelete(tile).await?;
@@ -61,9 +105,18 @@ impl Check<'_> {
                 );
             }
         } else {
-            reason.push_str("; its pyramid is not whole");
+            match contradicted {
+                Some(contradicted) => reason.push_str(&format!("; {contradicted}")),
+                None => reason.push_str("; its pyramid is not whole"),
+            }
             match self.source(entry, Some(&tile.name), self.position(entry, tile).await?) {
                 Source::There(position, record) if self.options.repair => {
+                    if is_placed {
+                        // Made anew, it stays where it is.
+                        let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+                        commit.undelete(tile).await?;
+                        commit.finish().await?;
+                    }
                     let why = format!("{reason}, and no record says that it is deleted");
                     self.queue(entry, position, record, why).await?;
                     repair = Some(Repair::Queued);

@@ -80,7 +80,8 @@ impl Check<'_> {
         }
         let mut reason = format!("what the catalog says of it cannot be ({})", tile.reason);
         let name = tile.name.as_ref().ok().map(String::as_str);
-        let repair = match (name, pyramid, tile.section.zip(tile.size)) {
+        let shape = { tile.but_for_place.as_ref() }.map(|tile| (tile.section, tile.size));
+        let repair = match (name, pyramid, shape) {
             // Only where it lies cannot be.
             (Some(name), Some(pyramid), Some((section, size))) => match self.options.repair {
                 true => {
@@ -132,6 +133,10 @@ impl Check<'_> {
             let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
             commit.end_nameless(tile.id).await?;
             commit.finish().await?;
+        }
+        // Made anew, it stays where it is.
+        if let Some(placed) = &tile.but_for_pyramid {
+            self.settle(entry, placed).await?;
         }
         let why = format!("what the catalog said of it could not be ({})", tile.reason);
         self.queue(entry, position, record, why).await?;

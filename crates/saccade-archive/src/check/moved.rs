@@ -3,8 +3,7 @@
 //! `saccade update` moves tiles as well, and nobody records that but the catalog: where the newest record was followed, another
 //! place is taken for that, unless the catalog's own list of changes says otherwise.
 
-use std::collections::HashMap;
-
+use saccade_core::transform::SectionFromTile;
 use saccade_core::voxel_box::VoxelBox;
 
 use super::{Check, CheckError, FindingKind, Repair, records::Said};
@@ -12,63 +11,107 @@ use crate::acquisition::Record;
 use crate::catalog::{ChangeReason, Placing, Tile, VolumeEntry, place};
 
 impl Check<'_> {
-    /// Notes a tile that does not lie where its newest record says.
-    pub(super) fn compare_place(&mut self, tile: &Tile) {
-        let said = self
-            .records
-            .as_ref()
-            .and_then(|records| records.elsewhere(tile));
-        self.elsewhere.extend(said.map(|said| (tile.clone(), said)));
-    }
-
-    /// Finds those of a section of which neither a record nor the catalog's changes say that they lie where they do.
-    pub(super) async fn moved(&mut self, entry: &VolumeEntry, z: u32) -> Result<(), CheckError> {
-        let elsewhere = std::mem::take(&mut self.elsewhere);
-        if elsewhere.is_empty() {
-            return Ok(());
+    /// Finds out whether a tile lies where neither a record nor the catalog's changes say that it does, whatever else is wrong with it:
+    /// one that is made anew stays where it is. As it is once that is mended; nothing, if it is not or need not be.
+    pub(super) async fn settle(
+        &mut self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+    ) -> Result<Option<Tile>, CheckError> {
+        let Some((records, said)) =
+            { self.records.as_ref() }.and_then(|records| Some((records, records.elsewhere(tile)?)))
+        else {
+            return Ok(None);
+        };
+        let shaped = records.shaped(tile);
+        let extent = entry.volume.extent();
+        // One that lies where no voxel is is told as that.
+        if place(extent, shaped.section, shaped.size, shaped.transform).is_none() {
+            return Ok(None);
         }
         let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let placings = catalog.placings(volume, z).await?;
-        let placings: HashMap<_, _> = placings
-            .iter()
-            .map(|placing| (placing.tile, placing))
-            .collect();
-        for (tile, said) in elsewhere {
-            let placing = placings
-                .get(&tile.id)
-                .filter(|now| now.revision == tile.revision);
-            let Some(why) = placing.and_then(|now| self.unexplained(entry, &tile, said, now))
-            else {
-                continue;
-            };
-            let record = self.record_at(entry, said.record).map(|(_, record)| record);
-            let (name, to) = match record {
-                Some(Record::Tile(record)) => (record.tile, record.transform),
-                Some(Record::Transform(record)) => (record.tile, record.transform),
-                _ => continue,
-            };
-            if name != tile.name || to == tile.transform {
-                continue;
-            }
-            // One that ingest could not follow is told with what is set aside.
-            if catalog.is_set_aside(volume, &name).await? {
-                continue;
-            }
-            let reason = format!(
-                "it lies at {:?}, its newest record (byte {}) says {:?}, and {why}",
-                tile.transform.elements(),
-                said.record,
-                to.elements()
-            );
-            let mut repair = None;
-            if self.options.repair {
-                catalog.set_transform(volume, &tile.name, to).await?;
-                repair = Some(Repair::Moved);
-            }
-            self.find(FindingKind::Spoilt, entry, Some(&tile), reason)
-                .repair = repair;
+        let z = tile.section;
+        if self.placings.as_ref().is_none_or(|(of, _)| *of != z) {
+            let placings = catalog.placings(volume, z).await?.into_iter();
+            self.placings = Some((z, placings.map(|placing| (placing.tile, placing)).collect()));
         }
-        Ok(())
+        let placing = { self.placings.as_ref() }
+            .and_then(|(_, placings)| placings.get(&tile.id))
+            .filter(|now| now.revision == tile.revision);
+        let its = placing.and_then(|now| self.its_place(entry, &shaped, said, now));
+        let Some((to, reason)) = its else {
+            return Ok(None);
+        };
+        // One that ingest could not follow is told with what is set aside.
+        if catalog.is_set_aside(volume, &tile.name).await? {
+            return Ok(None);
+        }
+        let mut settled = None;
+        if self.options.repair {
+            let mut commit = catalog.begin(volume).await?;
+            commit.lay(tile, to).await?;
+            commit.finish().await?;
+            settled = Some(Tile {
+                transform: to,
+                ..tile.clone()
+            });
+        }
+        self.find(FindingKind::Spoilt, entry, Some(tile), reason)
+            .repair = settled.as_ref().map(|_| Repair::Moved);
+        Ok(settled)
+    }
+
+    /// A tile that is called deleted and is about to be brought back, where it belongs: as its row says, or, where nothing explains
+    /// that, as its newest record does. The latter is added to the reason.
+    pub(super) async fn in_its_place(
+        &self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        reason: &mut String,
+    ) -> Result<Tile, CheckError> {
+        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
+        let records = self.records.as_ref();
+        let mut tile = tile.clone();
+        let Some(said) = records.and_then(|records| records.elsewhere(&tile)) else {
+            return Ok(tile);
+        };
+        let placing = catalog.placing(volume, tile.id).await?;
+        let shaped = records.map_or_else(|| tile.clone(), |records| records.shaped(&tile));
+        let its = placing.and_then(|now| self.its_place(entry, &shaped, said, &now));
+        if let Some((to, why)) = its
+            && !catalog.is_set_aside(volume, &tile.name).await?
+        {
+            tile.transform = to;
+            *reason = format!("{reason}; {why}");
+        }
+        Ok(tile)
+    }
+
+    /// Where a tile belongs that lies elsewhere than a record said, and why, if nothing explains that.
+    fn its_place(
+        &self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        said: Said,
+        now: &Placing,
+    ) -> Option<(SectionFromTile, String)> {
+        let extent = entry.volume.extent();
+        let why = match place(extent, tile.section, tile.size, tile.transform) {
+            None => "no voxel is there",
+            Some(_) => self.unexplained(entry, tile, said, now)?,
+        };
+        let (name, to) = match self.record_at(entry, said.record)?.1 {
+            Record::Tile(record) => (record.tile, record.transform),
+            Record::Transform(record) => (record.tile, record.transform),
+            Record::Delete(_) => return None,
+        };
+        let reason = format!(
+            "it lies at {:?}, its newest record (byte {}) says {:?}, and {why}",
+            tile.transform.elements(),
+            said.record,
+            to.elements()
+        );
+        (name == tile.name && to != tile.transform).then_some((to, reason))
     }
 
     /// Why nothing explains that a tile lies elsewhere than a record said; `None` if somebody may have moved it.
@@ -83,7 +126,13 @@ impl Check<'_> {
         if now.transform_position >= self.read?.offset {
             return None;
         }
-        if now.transform_position != said.position {
+        // A position of nothing that is said of the tile says nothing.
+        let is_of = |at: u64| match self.record_at(entry, at)?.1 {
+            Record::Tile(record) => Some(record.tile == tile.name),
+            Record::Transform(record) => Some(record.tile == tile.name),
+            Record::Delete(_) => None,
+        };
+        if now.transform_position != said.position && is_of(now.transform_position) == Some(true) {
             return Some("that one was not followed");
         }
         let lies = place(

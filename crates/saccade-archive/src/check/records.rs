@@ -150,9 +150,20 @@ impl Records {
     /// What the newest record of a tile's place says, if the catalog has the tile of its newest image and it does not lie there.
     pub(super) fn elsewhere(&self, tile: &Tile) -> Option<Said> {
         let newest = self.newest.get(&self.hasher.hash_one(&tile.name))?;
-        let is_newest = position_of(&tile.pyramid) == Some(newest.position);
+        let of = [position_of(&tile.pyramid), Some(tile.position)];
+        let is_newest = of.contains(&Some(newest.position));
         let said = newest.said.filter(|_| is_newest);
         said.filter(|said| said.hash != self.hasher.hash_one(bits(tile.transform)))
+    }
+
+    /// A tile with the section and the size that its newest record says.
+    pub(super) fn shaped(&self, tile: &Tile) -> Tile {
+        let newest = self.newest.get(&self.hasher.hash_one(&tile.name));
+        let mut tile = tile.clone();
+        if let Some(image) = newest.and_then(|newest| newest.image) {
+            (tile.section, tile.size) = (image.section, image.size);
+        }
+        tile
     }
 
     /// Whether any record is of a tile's image, or of its end.

@@ -46,6 +46,13 @@ impl Check<'_> {
             "the catalog calls it deleted, and neither a record nor a change tells of a deletion"
                 .to_owned();
         let pyramid = self.whole_pyramid(entry, &tile, position).await;
+        let tile = match pyramid.clone() {
+            Some(pyramid) => {
+                let named = Tile { pyramid, ..tile };
+                self.in_its_place(entry, &named, &mut reason).await?
+            }
+            None => tile,
+        };
         let mut repair = None;
         let extent = entry.volume.extent();
         let is_placed = place(extent, tile.section, tile.size, tile.transform).is_some();
@@ -55,12 +62,8 @@ impl Check<'_> {
                 " that is still kept: nobody knows whether it was deleted, and its pyramid is kept. Append its record to the \
                  acquisition once more, or one that it is deleted",
             );
-        } else if let Some(pyramid) = pyramid.clone().filter(|_| is_placed) {
+        } else if pyramid.is_some() && is_placed {
             if self.options.repair {
-                let tile = Tile {
-                    pyramid,
-                    ..tile.clone()
-                };
                 let mut commit = catalog.begin(volume).await?;
                 commit.undelete(&tile).await?;
                 commit.finish().await?;

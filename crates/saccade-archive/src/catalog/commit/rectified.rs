@@ -1,6 +1,9 @@
 //! Rows that say what nothing explains, made to say what they did.
 
+use saccade_core::transform::SectionFromTile;
+
 use super::Commit;
+use crate::catalog::database::Value;
 use crate::catalog::{CatalogError, ChangeReason, Tile, place};
 
 impl Commit<'_> {
@@ -41,6 +44,29 @@ impl Commit<'_> {
             to.into(),
             self.revision.into(),
         ];
+        self.run(update, &values).await?;
+        Ok(())
+    }
+
+    /// Has a tile lie elsewhere, if it is still as it was found, whatever else its row says.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn lay(&mut self, tile: &Tile, to: SectionFromTile) -> Result<(), CatalogError> {
+        let at = |transform| place(self.extent, tile.section, tile.size, transform);
+        let (old, new) = (at(tile.transform), at(to));
+        self.log_change(tile.id, old, new, ChangeReason::Transform)
+            .await?;
+        let update = "UPDATE tiles SET revision = $4, a = $5, b = $6, c = $7, d = $8, tx = $9, ty = $10 \
+                      WHERE id = $1 AND volume = $2 AND revision = $3 AND deleted = 0";
+        let mut values = vec![
+            tile.id.0.into(),
+            self.volume.into(),
+            tile.revision.into(),
+            self.revision.into(),
+        ];
+        values.extend(to.elements().map(Value::from));
         self.run(update, &values).await?;
         Ok(())
     }

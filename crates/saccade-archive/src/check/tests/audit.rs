@@ -18,7 +18,7 @@ impl Fixture {
     }
 
     /// Appends a record that counts as read, and returns its position.
-    async fn append(&self, record: &Record) -> u64 {
+    pub(super) async fn append(&self, record: &Record) -> u64 {
         let mut writer = RecordWriter::open(self.acquisition.path()).unwrap();
         let path = self.acquisition.path().join(RecordReader::FILE);
         let position = fs::metadata(&path).unwrap().len();
@@ -56,7 +56,7 @@ pub(super) fn at(x: f64) -> SectionFromTile {
     SectionFromTile::translation(DVec2::new(x, 7.0))
 }
 
-fn move_it(tile: &str, to: SectionFromTile) -> Record {
+pub(super) fn move_it(tile: &str, to: SectionFromTile) -> Record {
     Record::Transform(TransformRecord {
         tile: tile.to_owned(),
         transform: to,

@@ -1,6 +1,6 @@
 //! Rows that were changed by hand, and of which something else tells what they said.
 
-use super::audit::{at, repairs};
+use super::audit::{at, move_it, repairs};
 use super::*;
 use crate::acquisition::AcquisitionInfo;
 
@@ -44,6 +44,36 @@ impl Fixture {
             ..CheckOptions::default()
         };
         check(&self.archive, &options, &|_, _| {}).await.unwrap()
+    }
+
+    /// As ingest does with what waits for it.
+    async fn ingest(&self) {
+        let catalog = self.archive.catalog();
+        for waiting in catalog.waiting(VOLUME).await.unwrap() {
+            let (record, position) = (waiting.record, waiting.position);
+            let object = format!(
+                "tiles/v/{:06}/{}-again1-{position:x}.tif",
+                record.section, record.tile
+            );
+            let own = { self.names.iter() }.find(|own| position_of(own) == Some(position));
+            let bytes = fs::read(self.folder.path().join(own.unwrap())).unwrap();
+            let bytes = pyramid::named(bytes.into(), &object).unwrap();
+            let written = self.archive.storage().write_durable(&object, bytes);
+            written.await.unwrap();
+            let tile = NewTile {
+                name: record.tile,
+                section: record.section,
+                channel: 0,
+                size: record.size,
+                transform: record.transform,
+                pyramid: object,
+                position,
+            };
+            let mut commit = catalog.begin(VOLUME).await.unwrap();
+            commit.tile(&tile, catalog.clock().now()).await.unwrap();
+            commit.wait_no_more(position).await.unwrap();
+            commit.finish().await.unwrap();
+        }
     }
 
     async fn swap(&self, a: usize, b: usize) {
@@ -97,6 +127,126 @@ async fn of_tiles_that_only_their_rows_call_deleted_nothing_is_deleted() {
     assert!(of_t3.reason.contains("nobody knows"), "{}", of_t3.reason);
     assert!(fixture.path(3).is_file());
     assert!(catalog.tile(VOLUME, "t3").await.unwrap().is_none());
+}
+
+#[tokio::test]
+async fn tiles_that_are_brought_back_lie_where_they_did() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    catalog.set_transform(VOLUME, "t3", at(44.0)).await.unwrap();
+    let (own, moved) = (fixture.transform("t2").await, fixture.transform("t3").await);
+    // Elsewhere in the volume, and outside of it.
+    for x in ["tx + 31", "1e9"] {
+        for names in ["deleted = 1", "deleted = 1, pyramid = ''"] {
+            let of =
+                |set: &str, tile: &str| format!("UPDATE tiles SET {set} WHERE name = '{tile}'");
+            let elsewhere = of(&format!("{names}, tx = {x}"), "t2");
+            fixture.meddle(&[&elsewhere, &of(names, "t3")]).await;
+            let report = fixture.look(false).await;
+            for (tile, is_elsewhere) in [("t2", true), ("t3", false)] {
+                let mut findings = report.findings.iter();
+                let found = findings.find(|f| f.tile.as_deref() == Some(tile));
+                let reason = &found.unwrap().reason;
+                assert_eq!(
+                    reason.contains("its newest record"),
+                    is_elsewhere,
+                    "{reason}"
+                );
+            }
+            let back = [(FindingKind::Spoilt, Some(Repair::Restored)); 2];
+            assert_eq!(repairs(&fixture.look(true).await), back);
+            assert_eq!(fixture.transform("t2").await, own, "{elsewhere}");
+            // Its records do not say where somebody has moved it, but its changes do.
+            assert_eq!(fixture.transform("t3").await, moved);
+            assert_eq!(fixture.look(true).await.findings, []);
+        }
+    }
+}
+
+/// One that is made anew stays where somebody has moved it, but not where its row alone says.
+#[tokio::test]
+async fn what_is_made_anew_lies_where_it_did() {
+    for spoilt in [
+        "section = 3, tx = tx + 31",
+        "pyramid = '', tx = tx + 31",
+        "pyramid = '', c = -1",
+        "width = 100, tx = tx + 31",
+        "width = 0, b = 2",
+        "channel = 1, ty = ty + 22",
+        "deleted = 1, section = 3",
+        "deleted = 1, channel = 9, tx = tx + 31",
+        "deleted = 1, height = 255",
+        "deleted = 1, tx = 9e999",
+        "deleted = 1, a = -9e999, section = 3",
+    ] {
+        for moved in [None, Some(at(44.0))] {
+            let fixture = Fixture::new().await;
+            let catalog = fixture.archive.catalog();
+            if let Some(to) = moved {
+                // Of that the records say as well: what `saccade update` says is known by its row alone.
+                let position = fixture.append(&move_it("t2", to)).await;
+                let mut commit = catalog.begin(VOLUME).await.unwrap();
+                commit.transform("t2", to, Some(position)).await.unwrap();
+                commit.finish().await.unwrap();
+            }
+            let own = catalog.tile(VOLUME, "t2").await.unwrap().unwrap();
+            fixture
+                .meddle(&[&format!("UPDATE tiles SET {spoilt} WHERE name = 't2'")])
+                .await;
+            let report = fixture.look(true).await;
+            let is_told = |f: &Finding| f.tile.as_deref() == Some("t2") && f.repair.is_some();
+            assert!(
+                report.findings.iter().any(is_told),
+                "{spoilt}: {:?}",
+                report.findings
+            );
+            fixture.ingest().await;
+            let now = catalog.tile(VOLUME, "t2").await.unwrap().unwrap();
+            assert_eq!(
+                (now.transform, now.section, now.size, now.channel),
+                (own.transform, own.section, own.size, own.channel),
+                "{spoilt}, moved: {moved:?}"
+            );
+            // What it was made of before may be nobody's now.
+            let mut left = fixture.look(true).await.findings;
+            left.retain(|f| f.kind != FindingKind::Orphan);
+            assert_eq!(left, [], "{spoilt}");
+            catalog.refuse_impossible(VOLUME).await.unwrap();
+        }
+    }
+}
+
+/// Where only that is wrong which says up to where records were followed, the changes tell that somebody moved the tile.
+#[tokio::test]
+async fn a_position_of_nothing_moves_no_tile() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    let first = fixture.append(&move_it("t2", at(30.0))).await;
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit.transform("t2", at(30.0), Some(first)).await.unwrap();
+    commit.finish().await.unwrap();
+    catalog.set_transform(VOLUME, "t2", at(50.0)).await.unwrap();
+    let spoil = "UPDATE tiles SET transform_position = 3 WHERE name = 't2'";
+    fixture.meddle(&[spoil]).await;
+    fixture.look(true).await;
+    assert_eq!(fixture.transform("t2").await, at(50.0));
+}
+
+#[tokio::test]
+async fn what_was_deleted_names_nothing() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture.delete("t5").await;
+    fixture
+        .meddle(&["UPDATE tiles SET pyramid = 'nonsense' WHERE name = 't5'"])
+        .await;
+    assert!(catalog.refuse_impossible(VOLUME).await.is_err());
+    let ended = [(FindingKind::Spoilt, Some(Repair::TakenAway))];
+    let report = fixture.look(true).await;
+    assert_eq!(repairs(&report)[..1], ended, "{:?}", report.findings);
+    assert_eq!(fixture.look(true).await.findings, []);
+    assert!(catalog.tile(VOLUME, "t5").await.unwrap().is_none());
+    catalog.refuse_impossible(VOLUME).await.unwrap();
 }
 
 #[tokio::test]
