@@ -480,6 +480,8 @@ fn sqlite_case(error: &sqlx::Error) -> Case {
     match primary_code(error) {
         // SQLITE_BUSY, SQLITE_LOCKED.
         Some(5 | 6) => Case::Locked,
+        // SQLITE_IOERR_SHMSIZE: the memory beside the log, a file as well, finds no room when the catalog is opened.
+        _ if code(error) == Some(4874) => Case::Full,
         Some(11) => Case::Damaged,
         Some(13) => Case::Full,
         Some(26) => Case::Foreign,

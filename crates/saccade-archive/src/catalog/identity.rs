@@ -3,6 +3,7 @@
 use std::sync::OnceLock;
 use std::sync::atomic::Ordering::{AcqRel, Acquire};
 use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::time::Duration;
 
 use sqlx::{ConnectOptions as _, Connection as _};
 
@@ -168,6 +169,11 @@ impl Catalog {
         let _the_first_counts = self.inner.owner.identity.set(identity.to_owned());
     }
 
+    /// Whose it is, if that was said.
+    pub(crate) fn owner(&self) -> Option<&str> {
+        self.inner.owner.identity.get().map(String::as_str)
+    }
+
     /// Looks whether the catalog is still the archive's, see [`Self::belongs_to`].
     ///
     /// # Errors
@@ -200,6 +206,26 @@ impl Catalog {
             // It may have gone just now.
             Err(e) => self.look_for_file().and(Err(self.failed(e))),
         }
+    }
+
+    /// What went wrong, once it was looked what the file is now: who reads one while another is copied over it, or right after,
+    /// finds half of each, and takes it for damaged.
+    pub async fn look_again(&self, error: CatalogError) -> CatalogError {
+        /// Looks, and the pause after each: a copy may be under way.
+        const LOOKS: u32 = 10;
+        const PAUSE: Duration = Duration::from_millis(50);
+        if !matches!(error, CatalogError::Damaged { .. }) {
+            return error;
+        }
+        for _ in 0..LOOKS {
+            match self.refuse_copied_over().await {
+                Err(copied @ (CatalogError::Older { .. } | CatalogError::Another { .. })) => {
+                    return copied;
+                }
+                Ok(()) | Err(_) => self.clock().sleep(PAUSE).await,
+            }
+        }
+        error
     }
 
     fn or_another(&self, right: Result<bool, sqlx::Error>) -> Result<(), CatalogError> {
