@@ -128,6 +128,15 @@ class Parts(ArchiveTest):
         self.assertEqual(self.store.uploads(self.prefix), [], "who ends in peace leaves nothing")
         self.nothing_half()
 
+    def test_stopped_before_an_upload_has_its_number(self):
+        self.proxy.order = lambda kind, _, nth: "late" if kind == "begin" and nth == 0 else None
+        ingest = self.start("ingest", self.acquisition, *self.archive, "--workers", "1")
+        until("the store has begun one and tells nobody", lambda: self.store.uploads(self.prefix))
+        ingest.stop()
+        self.assertEqual(ingest.child.returncode, 0)
+        self.assertEqual(self.store.uploads(self.prefix), [], "the number is waited for")
+        self.nothing_half()
+
     def test_killed_between_parts(self):
         kills = [("begin", 0, "hold"), ("part", 0, "hold"), ("part", 1, "hold"), ("part", 2, "withhold"),
                  ("complete", 0, "hold"), ("complete", 0, "withhold")]

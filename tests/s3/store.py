@@ -123,11 +123,12 @@ def refusal(method, path, headers):
 class Proxy:
     """Forwards requests to the store, or does one of FAULTS to them.
 
-    Two more faults are for those who kill the client meanwhile: "hold" forwards nothing, and "withhold" does, but neither
-    answers before `release`.
+    Three more faults are for those who end the client meanwhile: "hold" forwards nothing, and "withhold" does, but neither
+    answers before `release`; "late" answers after LATE seconds.
     """
 
     FAULTS = ["busy", "reset", "lost", "cut", "drip"]
+    LATE = 3
 
     def __init__(self, store, seed):
         self.random = random.Random(seed)
@@ -192,6 +193,8 @@ class Proxy:
                 connection.close()
                 if kind in ("complete", "abort") and answer.status < 300:
                     proxy.ended.add(upload)
+                if fault == "late":
+                    time.sleep(proxy.LATE)
                 if fault == "withhold":
                     proxy.withheld += 1
                     proxy.release.wait()

@@ -246,7 +246,7 @@ impl ObjectStorage {
         let written = if bytes.len() <= WHOLE {
             self.store.put(&path, bytes.into()).await.map(|_| ())
         } else {
-            self.uploads.write(&*self.store, &path, &bytes).await
+            self.uploads.write(&self.store, &path, &bytes).await
         };
         written.map_err(|e| sorted(e, &format!("{}/{name}", self.location)))
     }

@@ -1,5 +1,8 @@
 //! Writing a long object in parts, which the store puts together in the end.
 
+use std::sync::Arc;
+use std::time::Duration;
+
 use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{
@@ -10,19 +13,24 @@ use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
+use crate::clock::{Clock as _, SystemClock};
+
 use super::sort::{is_transport, lost_upload};
 
 /// Length of a part \[bytes\]. At 280 kB/s one takes as long as a request may.
 const PART: usize = 8 << 20;
 /// Parts of one object on their way.
 const PARTS: usize = 4;
+/// How often an upload is aborted at most, and the pause in between.
+const ABORTS: u32 = 5;
+const PAUSE: Duration = Duration::from_millis(200);
 /// How often an object is sent at most whose upload broke off, or is unknown to the store.
 const UPLOADS: u32 = 3;
 
 /// Writes long objects. What comes to nothing is aborted, so that no parts stay in the store.
 #[derive(Debug)]
 pub(super) struct Uploads {
-    /// How many are being aborted for which nobody waits any more.
+    /// How many are begun or aborted for whom nobody may wait any more.
     given_up: watch::Sender<usize>,
 }
 
@@ -36,7 +44,7 @@ impl Uploads {
     /// Writes an object.
     pub(super) async fn write(
         &self,
-        store: &dyn ObjectStore,
+        store: &Arc<dyn ObjectStore>,
         path: &Path,
         bytes: &Bytes,
     ) -> Result<()> {
@@ -50,14 +58,17 @@ impl Uploads {
         self.write_once(store, path, bytes).await
     }
 
-    async fn write_once(&self, store: &dyn ObjectStore, path: &Path, bytes: &Bytes) -> Result<()> {
-        let options = PutMultipartOptions::default();
-        let upload = store.put_multipart_opts(path, options).await?;
-        let mut upload = Pending(Some(Upload::new(upload, path)), &self.given_up);
+    async fn write_once(
+        &self,
+        store: &Arc<dyn ObjectStore>,
+        path: &Path,
+        bytes: &Bytes,
+    ) -> Result<()> {
+        let mut upload = self.begin(store, path).await?;
         match upload.finish(bytes).await {
             Ok(()) => {}
             // The answer may have been lost. Who asks again is told then that there is no such upload.
-            Err(Unfinished::Complete(_)) if holds(store, path, bytes).await => {}
+            Err(Unfinished::Complete(_)) if holds(&**store, path, bytes).await => {}
             Err(Unfinished::Complete(e) | Unfinished::Parts(e)) => {
                 upload.abort().await;
                 return Err(e);
@@ -65,6 +76,21 @@ impl Uploads {
         }
         upload.0 = None;
         Ok(())
+    }
+
+    /// Begins an upload. The store's answer is waited for even if nobody wants it any more: without its number nothing could be
+    /// aborted, and the store may have begun it.
+    async fn begin(&self, store: &Arc<dyn ObjectStore>, path: &Path) -> Result<Pending> {
+        let (store, path, given_up) = (store.clone(), path.clone(), self.given_up.clone());
+        let counted = Counted::new(&given_up);
+        let begun = tokio::spawn(async move {
+            let options = PutMultipartOptions::default();
+            let upload = store.put_multipart_opts(&path, options).await?;
+            // If nobody waits for it, it is dropped in this order.
+            Ok((Pending(Some(Upload::new(upload, &path)), given_up), counted))
+        });
+        let begun = begun.await.map_err(|source| Error::JoinError { source })?;
+        begun.map(|(upload, _counted)| upload)
     }
 
     /// Returns once nothing is being aborted any more for which nobody waits.
@@ -75,7 +101,23 @@ impl Uploads {
 }
 
 /// An upload that is aborted when it is dropped: who waited for it gave up.
-struct Pending<'a>(Option<Upload>, &'a watch::Sender<usize>);
+struct Pending(Option<Upload>, watch::Sender<usize>);
+
+/// One more, until dropped.
+struct Counted(watch::Sender<usize>);
+
+impl Counted {
+    fn new(all: &watch::Sender<usize>) -> Self {
+        all.send_modify(|n| *n += 1);
+        Self(all.clone())
+    }
+}
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        self.0.send_modify(|n| *n -= 1);
+    }
+}
 
 struct Upload {
     upload: Box<dyn MultipartUpload>,
@@ -92,7 +134,7 @@ enum Unfinished {
     Complete(Error),
 }
 
-impl Pending<'_> {
+impl Pending {
     async fn finish(&mut self, bytes: &Bytes) -> Result<(), Unfinished> {
         match &mut self.0 {
             Some(upload) => upload.finish(bytes).await,
@@ -108,16 +150,15 @@ impl Pending<'_> {
     }
 }
 
-impl Drop for Pending<'_> {
+impl Drop for Pending {
     fn drop(&mut self) {
         let (Some(mut upload), Ok(runtime)) = (self.0.take(), Handle::try_current()) else {
             return;
         };
-        let given_up = self.1.clone();
-        given_up.send_modify(|n| *n += 1);
+        let counted = Counted::new(&self.1);
         runtime.spawn(async move {
             upload.abort().await;
-            given_up.send_modify(|n| *n -= 1);
+            drop(counted);
         });
     }
 }
@@ -158,11 +199,19 @@ impl Upload {
     async fn abort(&mut self) {
         // One that arrives later would stay.
         self.parts.shutdown().await;
-        if let Err(e) = self.upload.abort().await
-            && !lost_upload(&e)
-        {
-            let path = &self.path;
-            log::warn!("parts of {path} may be left in the object store, unseen: {e}");
+        for turn in 1..=ABORTS {
+            match self.upload.abort().await {
+                // What the store was about to take in may be in its way.
+                Err(e) if !lost_upload(&e) && turn < ABORTS => {
+                    log::debug!("an upload is not aborted yet: {e}");
+                    SystemClock.sleep(PAUSE).await;
+                }
+                Err(e) if !lost_upload(&e) => {
+                    let path = &self.path;
+                    log::warn!("parts of {path} may be left in the object store, unseen: {e}");
+                }
+                _ => return,
+            }
         }
     }
 }

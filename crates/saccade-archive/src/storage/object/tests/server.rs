@@ -150,14 +150,14 @@ async fn what_is_given_up_leaves_no_parts() {
         return;
     };
     let storage = server.storage("");
-    for name in ["part-hold", "complete-hold"] {
+    for (name, wait) in [("begin-late", 1), ("part-hold", 3), ("complete-hold", 3)] {
         let write = storage.write_durable(name, long(0));
-        let written = tokio::time::timeout(Duration::from_secs(3), write).await;
+        let written = tokio::time::timeout(Duration::from_secs(wait), write).await;
         assert!(written.is_err(), "it is held up: {written:?}");
         storage.settled().await;
         assert_eq!(storage.list("").await.unwrap(), [""; 0]);
     }
     let report = server.end();
-    assert_eq!(report.faults["hold"], 2);
+    assert_eq!((report.faults["late"], report.faults["hold"]), (1, 2));
     assert_eq!(report.uploads, [[0; 0]; 0]);
 }
