@@ -20,6 +20,8 @@ pub struct VisualizationArchive {
     catalog: Catalog,
     storage: Arc<dyn Storage>,
     randomness: Arc<dyn Randomness>,
+    /// Where it was opened.
+    location: Option<Arc<ArchiveLocation>>,
 }
 
 /// Why a visualization archive could not be opened.
@@ -81,12 +83,43 @@ pub enum ArchiveError {
         /// Where the catalog is.
         catalog: CatalogLocation,
     },
+    /// The storage that was opened holds nothing of the archive any more.
+    #[error(
+        "the archive's pyramids are not where they were: the place came back empty, or another archive's has it, and nothing more \
+         is written there. Put the right one back, as by mounting its disk, and this goes on; if they were lost, end this, and \
+         ingest the acquisition again into a new archive: {storage}"
+    )]
+    Replaced {
+        /// Where they lay.
+        storage: StorageLocation,
+    },
     /// The catalog could not be opened.
     #[error(transparent)]
     Catalog(#[from] CatalogError),
     /// The storage could not be opened.
     #[error(transparent)]
     Storage(#[from] StorageError),
+}
+
+impl ArchiveError {
+    /// Whether it passes only when somebody does something, however long that takes.
+    pub fn is_outage(&self) -> bool {
+        match self {
+            Self::Replaced { .. } => true,
+            Self::Catalog(error) => error.is_outage(),
+            Self::Storage(error) => error.is_outage(),
+            _ => false,
+        }
+    }
+
+    /// Whether the same request may succeed later.
+    pub fn is_transient(&self) -> bool {
+        match self {
+            Self::Catalog(error) => error.is_transient(),
+            Self::Storage(error) => error.is_transient(),
+            other => other.is_outage(),
+        }
+    }
 }
 
 /// What a folder may lack that has not what it should have.
@@ -171,7 +204,10 @@ impl VisualizationArchive {
                 (catalog, storage)
             }
         };
-        let archive = Self::from_parts(catalog, storage);
+        let archive = Self {
+            location: Some(Arc::new(location.clone())),
+            ..Self::from_parts(catalog, storage)
+        };
         if create {
             archive.identify(location).await?;
         } else {
@@ -187,6 +223,7 @@ impl VisualizationArchive {
             catalog,
             storage,
             randomness,
+            location: None,
         }
     }
 
@@ -205,6 +242,25 @@ impl VisualizationArchive {
     pub async fn identify(&self, location: &ArchiveLocation) -> Result<(), ArchiveError> {
         let (catalog, storage) = (&self.catalog, &*self.storage);
         identity::make(catalog, storage, location, &*self.randomness).await
+    }
+
+    /// Looks whether the storage is still the archive's: a disk that is not mounted any more leaves an empty folder, and a store
+    /// that was set up anew an empty bucket. Asks for one small object. Of an archive that was made of parts nothing is known.
+    ///
+    /// # Errors
+    ///
+    /// [`ArchiveError::Replaced`], or what storage and catalog say.
+    pub async fn verify_storage(&self) -> Result<(), ArchiveError> {
+        let Some(location) = &self.location else {
+            return Ok(());
+        };
+        let (catalog, storage) = (&self.catalog, &*self.storage);
+        match identity::still_belongs(catalog, storage, &*self.randomness).await? {
+            true => Ok(()),
+            false => Err(ArchiveError::Replaced {
+                storage: location.storage().clone(),
+            }),
+        }
     }
 
     /// What tells the storage from every other: its [`IDENTITY`], which it gets if it has none, also from who only reads.

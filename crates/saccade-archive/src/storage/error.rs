@@ -1,5 +1,9 @@
 use std::io;
 
+/// What is said of a store that has no such bucket.
+pub(super) const NO_BUCKET: &str =
+    "there is no such bucket; make it first, or check its name and AWS_ENDPOINT_URL";
+
 /// Why an object could not be read or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -144,6 +148,11 @@ impl StorageError {
     /// Whether the same request may succeed later without anyone changing the request.
     pub fn is_transient(&self) -> bool {
         self.is_outage() || matches!(self, Self::Io { .. })
+    }
+
+    /// Whether the store has no such bucket.
+    pub fn lacks_bucket(&self) -> bool {
+        matches!(self, Self::Refused { advice, .. } if *advice == NO_BUCKET)
     }
 
     /// Whether this process, or the system, has too many files open: nothing is wrong with what was asked for.

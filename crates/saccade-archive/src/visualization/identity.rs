@@ -48,6 +48,14 @@ enum Mark {
 }
 
 impl Mark {
+    async fn read(storage: &dyn Storage) -> Result<Self, StorageError> {
+        match storage.read(IDENTITY, None).await {
+            Ok(bytes) => Ok(Self::of(&bytes)),
+            Err(StorageError::NotFound { .. }) => Ok(Self::None),
+            Err(error) => Err(error),
+        }
+    }
+
     /// What an object says.
     fn of(bytes: &[u8]) -> Self {
         read_identity(bytes).map_or(Self::Damaged, Self::Whole)
@@ -62,11 +70,7 @@ struct Parts {
 
 impl Parts {
     async fn read(catalog: &Catalog, storage: &dyn Storage) -> Result<Self, ArchiveError> {
-        let mark = match storage.read(IDENTITY, None).await {
-            Ok(bytes) => Mark::of(&bytes),
-            Err(StorageError::NotFound { .. }) => Mark::None,
-            Err(error) => return Err(error.into()),
-        };
+        let mark = Mark::read(storage).await?;
         Ok(Self {
             catalog: catalog.identity().await?,
             storage: mark,
@@ -121,15 +125,10 @@ async fn meet(
         }
         return Ok(parts);
     }
-    // Of several, one at least must be there.
-    for name in &named {
-        match storage.size(name).await {
-            Ok(_) => return Ok(parts),
-            Err(StorageError::NotFound { .. }) => {}
-            Err(error) => return Err(error.into()),
-        }
+    match holds_one(storage, &named).await? {
+        true => Ok(parts),
+        false => Err(strangers(location)),
     }
-    Err(strangers(location))
 }
 
 /// Refuses parts of different archives, and changes nothing.
@@ -212,6 +211,47 @@ pub(super) async fn own(
         Mark::Whole(identity) => Some(identity),
         Mark::None | Mark::Damaged => None,
     })
+}
+
+/// Whether the storage is still that of the archive that was opened. One that was emptied before its catalog named any pyramid is
+/// given the identity again, as is one that has lost nothing else.
+pub(super) async fn still_belongs(
+    catalog: &Catalog,
+    storage: &dyn Storage,
+    randomness: &dyn Randomness,
+) -> Result<bool, ArchiveError> {
+    let Some(own) = catalog.owner() else {
+        return Ok(true);
+    };
+    let mark = match Mark::read(storage).await {
+        // It was there when the archive was opened.
+        Err(error) if error.lacks_bucket() => return Ok(false),
+        mark => mark?,
+    };
+    match mark {
+        Mark::Whole(there) => return Ok(there == own),
+        // The next `saccade ingest` writes it anew.
+        Mark::Damaged => return Ok(true),
+        Mark::None => {}
+    }
+    let named = catalog.some_pyramids().await?;
+    if !named.is_empty() && !holds_one(storage, &named).await? {
+        return Ok(false);
+    }
+    let there = created(Some(own.to_owned()), storage, randomness).await?;
+    Ok(there == Mark::Whole(own.to_owned()))
+}
+
+/// Whether one at least of these pyramids is there.
+async fn holds_one(storage: &dyn Storage, named: &[String]) -> Result<bool, StorageError> {
+    for name in named {
+        match storage.size(name).await {
+            Ok(_) => return Ok(true),
+            Err(StorageError::NotFound { .. }) => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(false)
 }
 
 /// Gives an identity to a storage that has none; what it has then may be another's who did so at the same time.

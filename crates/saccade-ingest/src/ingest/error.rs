@@ -1,3 +1,4 @@
+use saccade_archive::ArchiveError;
 use saccade_archive::acquisition::AcquisitionError;
 use saccade_archive::catalog::CatalogError;
 use saccade_archive::storage::StorageError;
@@ -17,6 +18,14 @@ pub enum IngestError {
     Storage {
         /// What went wrong.
         source: StorageError,
+        /// The tile.
+        tile: String,
+    },
+    /// Whether a pyramid was written where the others lie cannot be found out.
+    #[error("whether the pyramid of tile {tile:?} lies with the others cannot be found out")]
+    Archive {
+        /// What went wrong.
+        source: Box<ArchiveError>,
         /// The tile.
         tile: String,
     },

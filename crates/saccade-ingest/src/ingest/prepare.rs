@@ -10,11 +10,12 @@ use std::time::{Duration, SystemTime};
 use bytes::Bytes;
 use glam::{UVec2, UVec3};
 use saccade_archive::acquisition::{DeleteRecord, TileRecord, TransformRecord};
-use saccade_archive::catalog::{Catalog, CatalogError, NewTile, Quarantined, Waiting, place};
+use saccade_archive::catalog::{CatalogError, NewTile, Quarantined, Waiting, place};
 use saccade_archive::clock::Clock;
 use saccade_archive::image::{self, Image, ImageError, Wanted};
 use saccade_archive::pyramid::{self, EncodeError, Encoding};
-use saccade_archive::storage::{Storage, StorageError};
+use saccade_archive::storage::StorageError;
+use saccade_archive::{ArchiveError, VisualizationArchive};
 use saccade_core::volume::{Dtype, VoxelKind};
 
 use super::enter::{SetAside, retry};
@@ -173,8 +174,7 @@ pub(super) struct Context<'a> {
     /// Names of the volume's channels.
     pub(super) channels: &'a [String],
     pub(super) stored: Stored,
-    pub(super) storage: &'a dyn Storage,
-    pub(super) catalog: &'a Catalog,
+    pub(super) archive: &'a VisualizationArchive,
     pub(super) options: &'a IngestOptions,
     pub(super) progress: &'a dyn Progress,
     /// What paths are called where others read of them.
@@ -188,7 +188,13 @@ impl Context<'_> {
     where
         F: Future<Output = Result<T, CatalogError>>,
     {
-        retry(self.catalog.clock(), self.options, self.progress, ask).await
+        retry(
+            self.archive.catalog().clock(),
+            self.options,
+            self.progress,
+            ask,
+        )
+        .await
     }
 
     /// Makes a tile of a record, up to its durable pyramid. Why it cannot be is said without paths of this machine: those
@@ -357,7 +363,8 @@ impl Context<'_> {
     /// another, so that whoever has kept something of the damaged one does not take it for this.
     async fn unused_name(&self, record: &TileRecord, position: u64) -> Result<String, IngestError> {
         // Also of a tile of which nothing else can be understood, which this record mends.
-        let entered = || self.catalog.tile_pyramid(self.volume, &record.tile);
+        let catalog = self.archive.catalog();
+        let entered = || catalog.tile_pyramid(self.volume, &record.tile);
         let entered = self.retry(entered).await?;
         let attempt = entered.map_or(0, |pyramid| attempt_after(&pyramid, position));
         Ok(pyramid_name(self.volume, record, position, attempt))
@@ -371,25 +378,40 @@ impl Context<'_> {
         name: &str,
         pyramid: Bytes,
     ) -> Result<Result<(), StorageError>, IngestError> {
-        let mut backoff = Backoff::new(self.options.retry, self.catalog.clock());
+        let clock = self.archive.catalog().clock();
+        let mut backoff = Backoff::new(self.options.retry, clock);
         loop {
-            match self.storage.write_durable(name, pyramid.clone()).await {
+            let error = match self.write_once(name, pyramid.clone()).await {
                 Ok(()) => {
                     backoff.over(self.progress, &format!("tile {tile} is written now"));
                     return Ok(Ok(()));
                 }
-                Err(occupied @ StorageError::Occupied { .. }) => return Ok(Err(occupied)),
-                Err(e) => {
-                    if !backoff.may_go_on(e.is_outage(), e.is_transient()) {
-                        return Err(IngestError::Storage {
-                            source: e,
-                            tile: tile.to_owned(),
-                        });
-                    }
-                    backoff.say_and_wait(self.progress, &e).await;
+                Err(ArchiveError::Storage(occupied @ StorageError::Occupied { .. })) => {
+                    return Ok(Err(occupied));
                 }
+                Err(error) => error,
+            };
+            if !backoff.may_go_on(error.is_outage(), error.is_transient()) {
+                let tile = tile.to_owned();
+                return Err(match error {
+                    ArchiveError::Storage(source) => IngestError::Storage { source, tile },
+                    ArchiveError::Catalog(error) => error.into(),
+                    other => IngestError::Archive {
+                        source: Box::new(other),
+                        tile,
+                    },
+                });
             }
+            backoff.say_and_wait(self.progress, &error).await;
         }
+    }
+
+    /// Writes a pyramid to where the archive's lie: nothing is written elsewhere if that can be helped, and only what lies with
+    /// the others is entered.
+    async fn write_once(&self, name: &str, pyramid: Bytes) -> Result<(), ArchiveError> {
+        self.archive.verify_storage().await?;
+        self.archive.storage().write_durable(name, pyramid).await?;
+        self.archive.verify_storage().await
     }
 }
 

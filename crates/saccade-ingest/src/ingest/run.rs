@@ -118,8 +118,7 @@ pub async fn run(
             extent: volume.extent(),
             channels: &volume.channels,
             stored,
-            storage: archive.storage().as_ref(),
-            catalog,
+            archive,
             options,
             progress,
             called: &called,
@@ -162,7 +161,12 @@ pub async fn run(
     if tokio::time::timeout(SETTLING, settled).await.is_err() {
         log::warn!("parts of what was being written may be left in the object store, unseen");
     }
-    done?;
+    if let Err(error) = done {
+        return Err(match error {
+            IngestError::Catalog(error) => catalog.look_again(error).await.into(),
+            other => other,
+        });
+    }
     ingest.summary.early = catalog.statistics(&volume.name).await?.early;
     Ok(ingest.summary)
 }

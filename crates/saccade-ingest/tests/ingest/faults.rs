@@ -113,6 +113,16 @@ async fn a_full_disk_is_waited_out() {
     bench.is_complete().await;
 }
 
+/// Waits until it says why it waits.
+async fn why_it_waits(diary: &Diary) -> String {
+    loop {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        if let Some(why) = diary.held_up() {
+            return why;
+        }
+    }
+}
+
 /// As where the archive's disk is unmounted: an empty folder is in its place, and the catalog is elsewhere.
 #[tokio::test]
 async fn an_archive_whose_disk_is_away_is_waited_for() {
@@ -130,12 +140,7 @@ async fn an_archive_whose_disk_is_away_is_waited_for() {
     let (diary, cancel, options) = (Diary::default(), Cancel::new(), quick());
     let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
     let back = async {
-        let why = loop {
-            tokio::time::sleep(Duration::from_millis(100)).await;
-            if let Some(why) = diary.held_up() {
-                break why;
-            }
-        };
+        let why = why_it_waits(&diary).await;
         assert!(why.contains("is its disk mounted?"), "{why}");
         let entry = archive.catalog().entry(VOLUME).await.unwrap();
         assert_eq!(entry.tiles, 1, "nothing is acknowledged");
@@ -153,6 +158,77 @@ async fn an_archive_whose_disk_is_away_is_waited_for() {
         assert_eq!(pixels(tile).await, texture(SIZE, n));
     }
     assert!(orphans(&archive).await.is_empty());
+}
+
+/// As an object store does that comes back with nothing in it, or with another's: the catalog is still there.
+#[tokio::test]
+async fn nothing_is_entered_that_lies_elsewhere_than_the_rest() {
+    for is_anothers in [false, true] {
+        let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+        let at = |name: &str| folder.path().join(name);
+        let archive = archive(folder.path()).await;
+        scope.tile("t0", 0, SIZE, 0);
+        assert_eq!(scope.ingest(&archive).await.tiles, 1);
+
+        fs::create_dir(at("away")).unwrap();
+        for name in ["tiles", "identity"] {
+            fs::rename(at(name), at("away").join(name)).unwrap();
+        }
+        if is_anothers {
+            fs::write(at("identity"), format!("{}\n", "a".repeat(32))).unwrap();
+        }
+        for n in 1..4 {
+            scope.tile(&format!("t{n}"), u32::from(n), SIZE, n);
+        }
+        let (diary, cancel, options) = (Diary::default(), Cancel::new(), quick());
+        let ingest = run(scope.path(), &archive, &options, &diary, &cancel);
+        let back = async {
+            let why = why_it_waits(&diary).await;
+            assert!(
+                why.contains("came back empty")
+                    && why.contains(&folder.path().display().to_string()),
+                "{why}"
+            );
+            tokio::time::sleep(options.retry * 50).await;
+            let entry = archive.catalog().entry(VOLUME).await.unwrap();
+            assert_eq!(entry.tiles, 1, "nothing is acknowledged");
+            // What was on its way.
+            fs::remove_dir_all(at("tiles")).unwrap();
+            tokio::time::sleep(options.retry * 50).await;
+            assert!(!at("tiles").exists(), "nothing more is written");
+            for name in ["tiles", "identity"] {
+                fs::rename(at("away").join(name), at(name)).unwrap();
+            }
+        };
+        let both = async { tokio::join!(ingest, back) };
+        let both = tokio::time::timeout(Duration::from_secs(60), both).await;
+        assert_eq!(both.expect("it goes on").0.unwrap().tiles, 3);
+        assert_eq!(diary.held_up(), None);
+        let tiles = seen(&archive).await;
+        for n in 0..4 {
+            let tile = &tiles[&format!("t{n}")];
+            assert_eq!(pixels(tile).await, texture(SIZE, n));
+        }
+        assert!(orphans(&archive).await.is_empty());
+    }
+}
+
+/// As long as nothing is acknowledged nothing is lost: it goes on, and what lies there has its identity again.
+#[tokio::test]
+async fn a_place_that_was_emptied_before_anything_was_acknowledged_is_used() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    let identity = folder.path().join("identity");
+    let before = fs::read(&identity).unwrap();
+    fs::remove_file(&identity).unwrap();
+    scope.tile("t0", 0, SIZE, 0);
+    assert_eq!(scope.ingest(&archive).await.tiles, 1);
+    assert_eq!(fs::read(&identity).unwrap(), before);
+    // And where that alone is lost.
+    fs::remove_file(&identity).unwrap();
+    scope.tile("t1", 1, SIZE, 1);
+    assert_eq!(scope.ingest(&archive).await.tiles, 1);
+    assert_eq!(fs::read(&identity).unwrap(), before);
 }
 
 /// A file whose space is set aside first, and then filled.

@@ -1,6 +1,7 @@
 //! `saccade ingest`: from what a microscope writes to what can be looked at.
 
 use std::path::{Path, PathBuf};
+use std::pin::pin;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -428,15 +429,17 @@ impl Ingest {
             refuse_other_encoding(&archive, volume, &self.stored).await?;
         }
         let shown = Shown::new("ingest", None);
-        let taken_in = run(&acquisition, &archive, &options, &shown, &cancel);
+        let mut taken_in = pin!(run(&acquisition, &archive, &options, &shown, &cancel));
         let done = match &mut watching {
             None => taken_in.await,
-            // Whichever fails first is told; both end when they are cancelled.
+            // Whichever fails first is told; both end when they are cancelled, and what is being written is given up in order.
             Some(watching) => tokio::select! {
-                done = taken_in => done,
-                failed = watching => {
-                    failed??;
-                    return Ok(self.interrupted());
+                done = &mut taken_in => done,
+                ended = watching => {
+                    cancel.cancel();
+                    let done = taken_in.await;
+                    ended??;
+                    done
                 }
             },
         };
@@ -451,8 +454,8 @@ impl Ingest {
             early,
             ..
         } = done?;
-        let volume = match options.volume {
-            Some(name) => Some(name),
+        let volume = match &options.volume {
+            Some(name) => Some(name.clone()),
             None => AcquisitionInfo::read(&acquisition)
                 .ok()
                 .map(|info| info.name),

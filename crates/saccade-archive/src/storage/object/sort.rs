@@ -6,6 +6,7 @@ use std::io;
 use object_store::Error;
 
 use crate::storage::StorageError;
+use crate::storage::error::NO_BUCKET;
 
 /// The HTTP status that ended a request, if one did.
 ///
@@ -71,7 +72,7 @@ pub(super) fn sorted(error: Error, path: &str) -> StorageError {
         };
     }
     let advice = if says(&error, "NoSuchBucket") || matches!(error, Error::NotFound { .. }) {
-        "there is no such bucket; make it first, or check its name and AWS_ENDPOINT_URL"
+        NO_BUCKET
     } else if says(&error, "AuthorizationHeaderMalformed")
         || says(&error, "PermanentRedirect")
         || says(&error, "incorrectly configured region")
