@@ -58,8 +58,8 @@ impl Solution {
 pub(crate) struct Listed {
     /// The image as the list names it.
     pub(crate) file: String,
-    /// What solutions call it: the image's name without folder and extension, unless the list has ids for several tiles of
-    /// that name.
+    /// What solutions call it: the image's name without folder and extension; where several have that name, what the list has
+    /// instead, its tile's id or the image with its folders.
     pub(crate) known_as: String,
     /// Low corner in its section \[pixels\].
     pub(crate) corner: DVec2,
@@ -110,12 +110,25 @@ pub(crate) struct List {
 }
 
 impl List {
-    fn of_lines(tiles: Vec<ListedTile>, solution: Option<Solution>, path: &Path) -> Self {
+    /// Of lines, and of those that registration made of them, in a file of its own.
+    fn of_lines(
+        tiles: Vec<ListedTile>,
+        registered: Option<(PathBuf, Vec<ListedTile>)>,
+        path: &Path,
+    ) -> Self {
         let cut_at = tiles.last().filter(|tile| tile.may_be_cut);
         let cut_at = cut_at.map(|tile| tile.line);
         let (tiles, note) = twice::lines_once(tiles, path);
+        let mut tiles: Vec<_> = tiles.into_iter().map(Listed::from).collect();
+        let names = counted(tiles.iter().map(Listed::stem));
+        for tile in &mut tiles {
+            if names[tile.stem()] > 1 {
+                tile.known_as.clone_from(&tile.file);
+            }
+        }
+        let solution = registered.map(|(path, lines)| of_corners(path, &lines, &tiles));
         Self {
-            tiles: tiles.into_iter().map(Listed::from).collect(),
+            tiles,
             channels: None,
             solution,
             stage: None,
@@ -193,7 +206,7 @@ pub(crate) fn read(path: &Path) -> Result<List, AcquisitionError> {
             }
             refuse_link_out(&registered)?;
             let solution = match tile_configuration::read(&registered) {
-                Ok(tiles) => Some(of_corners(&registered, &tiles)),
+                Ok(lines) => Some((registered, lines)),
                 Err(AcquisitionError::Read { source, .. })
                     if source.kind() == io::ErrorKind::NotFound =>
                 {
@@ -283,24 +296,56 @@ pub(crate) fn is_project(path: &Path) -> bool {
     readable(&text).contains("t2_patch")
 }
 
-fn of_corners(path: &Path, tiles: &[ListedTile]) -> Solution {
-    let transforms = tiles.iter().map(|tile| {
-        let transform = SectionFromTile::translation(tile.corner);
-        (tile.name().to_owned(), transform)
-    });
-    Solution {
-        path: path.to_owned(),
-        transforms: transforms.collect(),
+/// How often each name comes.
+fn counted<'a>(names: impl Iterator<Item = &'a str>) -> HashMap<String, usize> {
+    let mut counts = HashMap::new();
+    for name in names {
+        *counts.entry(name.to_owned()).or_default() += 1;
     }
+    counts
+}
+
+/// Of the lines of a registered list, by the names of the list's tiles. An image that is written alike in both is the same one; so
+/// is the only one of its name, unless both say in which folder it lies, and say so differently.
+fn of_corners(path: PathBuf, lines: &[ListedTile], tiles: &[Listed]) -> Solution {
+    let corner = |line: &ListedTile| SectionFromTile::translation(line.corner);
+    let written: HashMap<&str, _> = lines.iter().map(|l| (&*l.file, corner(l))).collect();
+    let names = counted({ written.keys() }.map(|file| tile_list::stem(file)));
+    let only: HashMap<_, _> = { written.keys() }
+        .map(|file| (tile_list::stem(file), *file))
+        .filter(|(name, _)| names[*name] == 1)
+        .collect();
+    let known = tiles.iter().filter_map(|tile| {
+        let alone = || {
+            let file = only
+                .get(tile.stem())
+                .filter(|_| tile.known_as == tile.stem())?;
+            may_be_one(file, &tile.file).then(|| &written[file])
+        };
+        let place = written.get(&*tile.file).or_else(alone)?;
+        Some((tile.known_as.clone(), *place))
+    });
+    let transforms = known.collect();
+    Solution { path, transforms }
+}
+
+/// Whether two paths of one name may mean one image: as far as both say in which folders it lies, they say the same.
+fn may_be_one(one: &str, other: &str) -> bool {
+    let folders = |file: &str| -> Vec<String> {
+        let parts = file.split(['/', '\\']).rev().skip(1);
+        let parts = parts.filter(|part| !part.is_empty() && *part != ".");
+        parts.map(str::to_owned).collect()
+    };
+    folders(one)
+        .into_iter()
+        .zip(folders(other))
+        .all(|(a, b)| a == b)
 }
 
 /// Tells apart what solutions call tiles: by their images, but by other words where several tiles have images of one name.
 /// Such words may be what another image is called, of all those in `images`, and are then made others.
 fn tell_apart(tiles: &mut [Listed], otherwise: &[String], images: &HashSet<String>) {
-    let mut of_name: HashMap<String, usize> = HashMap::new();
-    for tile in &*tiles {
-        *of_name.entry(tile.stem().to_owned()).or_default() += 1;
-    }
+    let of_name = counted(tiles.iter().map(Listed::stem));
     let mut taken = images.clone();
     for (tile, otherwise) in tiles.iter_mut().zip(otherwise) {
         let stem = tile.stem();

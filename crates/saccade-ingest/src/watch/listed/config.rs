@@ -125,15 +125,22 @@ pub enum ListError {
     },
     /// No image can be read, from which the volume's size or bits could be told.
     #[error(
-        "none of the {tiles} images that the list names, such as {first:?}, is there and can be read, so that size and \
-         bits of the volume are not known; copy them into {}, or say --extent, --origin and --bits: {}",
-        folder.display(), list.display()
+        "none of the {tiles} images that the list names, such as {such_as}, is there and can be read, so that {} of the volume \
+         are not known; copy them into {}, or say {}: {}",
+        unknown,
+        folder.display(),
+        options,
+        list.display()
     )]
     NoImages {
         /// Tiles of the list.
         tiles: usize,
-        /// The first, as the list names it.
-        first: String,
+        /// The first of which it can be told why, or of all, as the list names it, and why.
+        such_as: String,
+        /// What of the volume cannot be told.
+        unknown: &'static str,
+        /// The options that would say it.
+        options: &'static str,
         /// Where images are looked for.
         folder: PathBuf,
         /// The list.

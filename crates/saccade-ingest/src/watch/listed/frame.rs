@@ -16,7 +16,7 @@ use super::super::{LINK, SETTINGS, WatchError, is_unused};
 use super::counted::Counted;
 use super::index::{Index, Sought};
 use super::source::{Adopted, Listing, adopt, line_of, raw};
-use super::{ListConfig, ListError};
+use super::{ListConfig, ListError, MOST_ASKED};
 use crate::replay::ReplayError;
 use crate::replay::acquisition::spanned;
 use crate::replay::lists::Solution;
@@ -226,9 +226,23 @@ pub(super) fn begin(
     let area = |size: &UVec2| u64::from(size.x) * u64::from(size.y);
     let largest = sizes.iter().flatten().copied().max_by_key(area);
     if asks && largest.is_none() {
+        let mut told = tiles.iter().take(MOST_ASKED).filter_map(|tile| {
+            let why = { index.blocked(&tile.file) }
+                .or_else(|| index.not_taken(&tile.file).map(|(_, why)| why))?;
+            Some(format!("{:?} ({why})", tile.file))
+        });
+        let first = tiles.first().map_or("", |tile| &tile.file);
+        let such_as = told.next().unwrap_or_else(|| format!("{first:?}"));
+        let (unknown, options) = match (spans, config.dtype) {
+            (true, None) => ("size and bits", "--extent, --origin and --bits"),
+            (true, Some(_)) => ("size and place", "--extent and --origin"),
+            (false, _) => ("bits", "--bits"),
+        };
         return Err(ListError::NoImages {
             tiles: tiles.len(),
-            first: tiles.first().map_or_else(String::new, |t| t.file.clone()),
+            such_as,
+            unknown,
+            options,
             folder: folder.to_owned(),
             list: config.list.clone(),
         });

@@ -14,6 +14,26 @@ use saccade_ingest::{Cancel, HeldUp};
 use super::{SIZE, Scope, config, roomy, write};
 use crate::scope::{archive, pixels, seen, texture, tiff8};
 
+/// Who has one image at first is told as much as who lacks one later.
+#[test]
+fn why_no_image_at_all_is_there_is_told() {
+    let scope = Scope::new();
+    let list = scope.file("list.txt");
+    let refusal = || {
+        let mut watch = scope.watch(config(&list));
+        follow(&mut watch, Until::End, true, &Cancel::new()).unwrap_err()
+    };
+    write(&list, "none.tif 0 0 0\nu/a.tif 0 0 0\n");
+    let told = refusal().to_string();
+    assert!(told.contains("such as \"none.tif\", is there"), "{told}");
+    scope.image("a", 1);
+    fs::create_dir(scope.file("u")).unwrap();
+    let refused = refusal();
+    let why = r#"such as "u/a.tif" ("pictures/a.tif" is not in the folder that the list names)"#;
+    assert!(matches!(refused, ListError::NoImages { .. }), "{refused:?}");
+    assert!(refused.to_string().contains(why), "{refused}");
+}
+
 /// Of what is nothing to read, nothing is opened, and the rest is taken in.
 #[cfg(unix)]
 #[tokio::test]

@@ -152,3 +152,72 @@ async fn registration_of_some_tiles_moves_those() {
     let said = Input::Acquisition(replayed).describe();
     assert!(said.contains("2 of which are later moved by"), "{said}");
 }
+
+/// As microscopes write them that give each tile, or each channel, a folder.
+#[tokio::test]
+async fn images_of_one_name_are_told_apart_by_their_folders() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let files = ["u/r", "v/r", "only", "other"];
+    for (seed, name) in (0..).zip(files) {
+        scope.image(name, seed);
+    }
+    let tiles = |lines: &[(&str, f64)]| {
+        let lines = lines
+            .iter()
+            .map(|(file, x)| format!("{file}; ; ({x}, 0)\n"));
+        format!("dim = 2\n{}", lines.collect::<String>())
+    };
+    let full = files.map(|name| format!("pictures/{name}.tif"));
+    let [u, v, only, other] = full.each_ref().map(String::as_str);
+    let places = async || {
+        let tiles = seen(&archive).await;
+        let places = tiles.values().map(|tile| tile.transform[4]);
+        places.collect::<Vec<_>>()
+    };
+    write(
+        &list,
+        tiles(&[(u, 0.0), (v, 45.0), (only, 90.0), (other, 135.0)]),
+    );
+    let far = [(u, 500.0), (v, 546.5), ("only.tif", 590.0), (other, 635.0)];
+    write(&registered, tiles(&far));
+    scope.once(config(&list), &archive).await;
+    let names: Vec<_> = seen(&archive).await.into_keys().collect();
+    assert_eq!(names, ["only", "other", "pictures_v_r", "r"]);
+    assert_eq!(places().await, [90.0, 135.0, 46.5, 0.0]);
+    // It is the same in a replay.
+    let aligned = || {
+        let Input::Acquisition(replayed) = detect(&scope.path()).unwrap() else {
+            panic!("a list")
+        };
+        let aligned = replayed
+            .tiles
+            .into_iter()
+            .map(|tile| tile.aligned.is_some());
+        aligned.collect::<Vec<_>>()
+    };
+    assert_eq!(aligned(), [true; 4]);
+    // A name alone says nothing of two.
+    let rest = [(only, 591.0), (other, 640.0)];
+    write(
+        &registered,
+        tiles(&[[("r.tif", 500.0)].as_slice(), &rest].concat()),
+    );
+    assert_eq!(aligned(), [false, false, true, true]);
+    // Two of that name say nothing of one that is neither.
+    write(
+        &list,
+        tiles(&[("r.tif", 0.0), (only, 90.0), (other, 135.0)]),
+    );
+    let two = [("x/r.tif", 3.0), ("y/r.tif", 9.0)];
+    let elsewhere = [("x/r.tif", 3.0)];
+    write(&registered, tiles(&[two.as_slice(), &rest].concat()));
+    assert_eq!(aligned(), [false, true, true]);
+    // One in a folder that the list does not say may be it, one in another folder is not.
+    write(&registered, tiles(&[elsewhere.as_slice(), &rest].concat()));
+    assert_eq!(aligned(), [true; 3]);
+    write(&list, tiles(&[(u, 0.0), (only, 90.0), (other, 135.0)]));
+    assert_eq!(aligned(), [false, true, true]);
+}
