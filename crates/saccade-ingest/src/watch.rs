@@ -35,6 +35,7 @@ use crate::held_up::HeldUp;
 use crate::simulate::settings::{Settings, difference, volume_differences};
 use list::List;
 use looking::{Looks, Passes, look_on};
+use scan::Doubles;
 use stamp::Seen;
 use stamps::Stamps;
 
@@ -400,6 +401,19 @@ impl<F: Folders> Watch<F> {
         ))
     }
 
+    /// Which files came since this was asked last that mean a tile which another file of their folder means as well.
+    pub fn doubles(&mut self) -> Option<String> {
+        let Doubles { such_as, files } = self.scanner.doubles();
+        let Found { file, place } = such_as?;
+        Some(format!(
+            "{files} files are named so that other files of their folder mean the same tiles, such as {file:?} of tile {}: of such \
+             files the one that was found last counts, and of those found at once the last by name. Let the pattern say what tells \
+             them apart; or take away what is not to be seen, and touch what is, for a file that is gone leaves its tile: {}",
+            place.name(),
+            self.folder.display()
+        ))
+    }
+
     /// Where the records are kept: what [`crate::ingest::run`] follows.
     pub fn acquisition(&self) -> &Path {
         &self.kept
@@ -537,6 +551,9 @@ impl<F: Folders> Looks for Watch<F> {
         {
             log::warn!("{why}; files that fit are waited for");
             self.tells_misfits = false;
+        }
+        if let Some(doubles) = self.doubles() {
+            log::warn!("{doubles}");
         }
         let blocked = self.scanner.blocked();
         let lost = self.scanner.lost();

@@ -42,7 +42,7 @@ pub struct PatternError {
 }
 
 /// What a name says.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Place {
     /// Section, as it is numbered there.
     pub section: u32,

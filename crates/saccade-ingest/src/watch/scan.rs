@@ -1,6 +1,6 @@
 //! Which files are new, found with few questions to the file system.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet, VecDeque};
 use std::fs;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 use std::io;
@@ -132,6 +132,9 @@ const MOST_BLOCKED: usize = 16;
 const MOST_LOST: usize = 16;
 const LOST_PER_LOOK: usize = 64;
 
+/// So many files are remembered of which it was said that they mean what another one means.
+const MOST_DOUBLES: usize = 1 << 16;
+
 /// An image that cannot be looked at though its name is there.
 struct Lost {
     place: Place,
@@ -154,6 +157,17 @@ struct Listing {
     /// Its time before it was listed.
     modified: Option<SystemTime>,
     entries: Box<dyn Iterator<Item = io::Result<Entry>> + Send>,
+    /// Hashes of the places that its files mean.
+    places: HashSet<u64>,
+}
+
+/// Files that mean a place which another file of their folder means as well.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Doubles {
+    /// One of them.
+    pub(super) such_as: Option<Found>,
+    /// How many.
+    pub(super) files: usize,
 }
 
 /// Goes round the folders, a bounded number of questions at a time.
@@ -189,6 +203,9 @@ pub struct Scanner<F> {
     lost: BTreeMap<PathBuf, Lost>,
     /// The last of them that was asked for.
     lost_at: PathBuf,
+    /// Files that mean a place which another file of their folder means, by the hashes of their paths, and those of them that
+    /// were not asked for yet.
+    doubles: (HashSet<u64>, Doubles),
     /// When the last of them was told of.
     told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
@@ -225,6 +242,7 @@ impl<F: Folders> Scanner<F> {
             blocked: BTreeSet::new(),
             lost: BTreeMap::new(),
             lost_at: PathBuf::new(),
+            doubles: (HashSet::new(), Doubles::default()),
             told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
             counts: Counts::default(),
@@ -265,6 +283,11 @@ impl<F: Folders> Scanner<F> {
         let said = first.filter_map(|path| no_image::why(&self.root.join(path)));
         let more = self.lost.len().saturating_sub(MOST_LOST);
         (said.collect(), more)
+    }
+
+    /// Files that were met since this was asked last, and mean what another one of their folder means: each once.
+    pub(super) fn doubles(&mut self) -> Doubles {
+        std::mem::take(&mut self.doubles.1)
     }
 
     /// Looks again at some of those.
@@ -427,6 +450,7 @@ impl<F: Folders> Scanner<F> {
                         folder,
                         modified: settled.then_some(modified),
                         entries,
+                        places: HashSet::new(),
                     });
                 }
                 Ok((_, None)) => {}
@@ -517,6 +541,15 @@ impl<F: Folders> Scanner<F> {
             return;
         };
         self.counts.fit += 1;
+        if !listing.places.insert(self.hasher.hash_one(&place)) {
+            let file = below.to_string_lossy().into_owned();
+            let (known, new) = &mut self.doubles;
+            if known.len() < MOST_DOUBLES && known.insert(self.hasher.hash_one(&file)) {
+                new.files += 1;
+                let place = place.clone();
+                new.such_as.get_or_insert(Found { file, place });
+            }
+        }
         *left = left.saturating_sub(1);
         let whole = self.root.join(&below);
         match self.folders.stamp(&whole) {

@@ -1,4 +1,5 @@
 mod again;
+mod conformance;
 mod scanner;
 
 use std::path::Path;

@@ -72,7 +72,9 @@ impl Folders for Counted {
         folder: &Path,
     ) -> io::Result<Box<dyn Iterator<Item = io::Result<Entry>> + Send>> {
         self.asked.set(self.asked.get() + 1);
-        let entries = self.folders.lock().unwrap()[folder].1.clone();
+        let folders = self.folders.lock().unwrap();
+        let (_, entries) = folders.get(folder).ok_or(io::ErrorKind::NotFound)?;
+        let entries = entries.clone();
         let count = Arc::clone(&self.entries);
         Ok(Box::new(entries.into_iter().map(move |entry| {
             count.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
@@ -82,6 +84,13 @@ impl Folders for Counted {
 
     fn stamp(&self, file: &Path) -> io::Result<Stamp> {
         self.asked.set(self.asked.get() + 1);
+        let folders = self.folders.lock().unwrap();
+        let listed = file.parent().and_then(|folder| folders.get(folder));
+        let is_there =
+            listed.is_some_and(|(_, all)| all.iter().any(|entry| file.ends_with(&entry.name)));
+        if !is_there {
+            return Err(io::ErrorKind::NotFound.into());
+        }
         let stamps = self.stamps.lock().unwrap();
         Ok(stamp(stamps.get(file).copied().unwrap_or(1)))
     }
@@ -89,6 +98,24 @@ impl Folders for Counted {
     fn now(&self) -> SystemTime {
         Self::at(1_000_000 + self.passed.get())
     }
+}
+
+#[test]
+fn the_file_system_of_numbers_conforms() {
+    let disk = Counted::default();
+    disk.folders
+        .lock()
+        .unwrap()
+        .insert("/r".into(), (1, Vec::new()));
+    let add = |path: &str, is_folder: bool| {
+        let (folder, name) = path.rsplit_once('/').unwrap_or(("", path));
+        disk.add(folder, name, is_folder, 1);
+        if is_folder {
+            let path = Path::new("/r").join(path);
+            disk.folders.lock().unwrap().insert(path, (1, Vec::new()));
+        }
+    };
+    conformance::conforms(&disk, Path::new("/r"), add);
 }
 
 /// One that is not whole is told of after a while; whoever writes it may still go on, and its folder does not change.
@@ -384,4 +411,31 @@ impl Folders for Young {
         Counted::at(Self::BEGIN)
             + Duration::from_millis(250) * u32::try_from(self.now.get()).unwrap()
     }
+}
+
+/// Numbers may be written with zeros before them, and what does not matter may differ.
+#[test]
+fn files_of_one_folder_that_mean_one_place_are_told_once() {
+    let disk = Counted::default();
+    for name in ["r1_a.tif", "r2_a.tif", "r01_a.tif", "r1_b.tif"] {
+        disk.add("s1", name, false, 1);
+    }
+    disk.add("s2", "r1_a.tif", false, 1);
+    for folder in ["s1", "s2"] {
+        disk.add("", folder, true, 1);
+    }
+    let pattern: Pattern = "s{section}/r{row}_{}.tif".parse().unwrap();
+    let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern);
+    let mut look = || {
+        scanner.look(99).unwrap();
+        let Doubles { such_as, files } = scanner.doubles();
+        (such_as.map(|found| found.file), files)
+    };
+    assert_eq!(look(), (Some("s1/r01_a.tif".to_owned()), 2));
+    assert_eq!(look(), (None, 0));
+    // The folder is listed again, and what was told is not told again.
+    disk.add("s1", "r002_c.tif", false, 2);
+    assert_eq!(look(), (Some("s1/r002_c.tif".to_owned()), 1));
+    disk.add("s2", "r7_c.tif", false, 3);
+    assert_eq!(look(), (None, 0));
 }
