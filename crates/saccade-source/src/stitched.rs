@@ -15,10 +15,10 @@
 //!   A section counts as soon as it has a tile of any channel. Where a voxel spans none, see [`Gaps`];
 //!   [`AlongZ`] says what else one can be that spans several.
 //! - A tile is there if it is of the voxel's channel and the sample lies in the tile's rectangle (low edges
-//!   included, high ones not) and not in a blank sub-tile. Of several, those count whose pixels are at
+//!   included, high ones not) and not in a sub-tile of its finest level that is blank. Of several, those count whose pixels are at
 //!   most one and a half times as large as the smallest ones there: a region imaged at a high magnification is
 //!   seen within an overview at a low one \[003 §3.3\]. Of these, the one whose centre is nearest
-//!   wins, then the one that changed last, then the one with the larger id; or all are blended
+//!   wins, then the one whose image was recorded last; or all are blended
 //!   ([`Overlaps`]).
 //! - The value is interpolated linearly, or as [`Interpolation`] says, in the pyramid level whose pixels are most like the voxel
 //!   in size, with the tile's edge pixels repeated outward; it is at least 1. Where no tile is: 0.
@@ -57,6 +57,7 @@ mod damage;
 mod disk_cache;
 mod error;
 mod follow;
+mod holes;
 mod index;
 mod resample;
 mod sampling;

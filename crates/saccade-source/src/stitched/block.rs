@@ -200,8 +200,8 @@ impl Block {
         Some(bytes.freeze())
     }
 
-    /// A block that was made bytes of; `None` if it was not. Its chunks share the bytes' memory.
-    pub(super) fn from_bytes(bytes: &Bytes) -> Option<Self> {
+    /// A block that was made bytes of, whose chunks have `chunk_bytes` each; `None` if it was not. They share the bytes' memory.
+    pub(super) fn from_bytes(bytes: &Bytes, chunk_bytes: usize) -> Option<Self> {
         let mut table = bytes.clone();
         let mut number = || table.try_get_u32_le().ok();
         let size = UVec3::new(number()?, number()?, number()?);
@@ -217,8 +217,7 @@ impl Block {
             let max = table.try_get_u16_le().ok()?;
             chunks.push(match length {
                 0 if (min, max) == (0, 0) => CutChunk::Empty,
-                0 => return None,
-                _ if length > voxels.len() => return None,
+                _ if length != chunk_bytes || length > voxels.len() => return None,
                 _ => CutChunk::Voxels(voxels.split_to(length), ValueRange { min, max }),
             });
         }
@@ -246,13 +245,23 @@ impl Block {
     }
 }
 
-/// What lies in the cache on disk as a block: it is one, or it is built anew.
+/// What lies in the cache on disk as a block: it is one, or it is built anew. Behind the length of its chunks.
 #[cfg(any(test, fuzzing))]
 pub(crate) fn fuzz(bytes: &[u8]) {
-    let bytes = Bytes::copy_from_slice(bytes);
-    let Some(block) = Block::from_bytes(&bytes) else {
+    let mut bytes = Bytes::copy_from_slice(bytes);
+    let Some(chunk_bytes) = bytes.try_get_u8().ok().map(usize::from).filter(|n| *n > 0) else {
         return;
     };
+    let Some(block) = Block::from_bytes(&bytes, chunk_bytes) else {
+        return;
+    };
+    assert!(
+        block.chunks.iter().all(|chunk| match chunk {
+            CutChunk::Voxels(voxels, _) => voxels.len() == chunk_bytes,
+            CutChunk::Empty | CutChunk::Failed(_) => true,
+        }),
+        "chunks of other lengths"
+    );
     assert_eq!(
         block.to_bytes(),
         Some(bytes.clone()),
@@ -270,7 +279,7 @@ pub(crate) fn fuzz(bytes: &[u8]) {
     });
     assert!(voxels.iter().all(|len| *len <= bytes.len()));
     assert!(
-        Block::from_bytes(&bytes.slice(..bytes.len() - 1)).is_none(),
+        Block::from_bytes(&bytes.slice(..bytes.len() - 1), chunk_bytes).is_none(),
         "it is cut"
     );
 }

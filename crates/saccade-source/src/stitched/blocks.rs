@@ -191,7 +191,9 @@ impl Inner {
         };
         let description = [identity, description.as_bytes()].concat();
         let kept = disk.get(&description).await;
-        if let Some(block) = kept.and_then(|bytes| Block::from_bytes(&bytes)) {
+        let chunk_bytes =
+            self.volume.chunk.as_usizevec3().element_product() * self.volume.dtype.bytes();
+        if let Some(block) = kept.and_then(|bytes| Block::from_bytes(&bytes, chunk_bytes)) {
             self.from_disk.fetch_add(1, Ordering::Relaxed);
             return Ok(block);
         }

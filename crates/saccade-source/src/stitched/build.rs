@@ -197,7 +197,7 @@ impl Builder {
     pub(super) fn description(&self, place: Place, plan: &Plan) -> String {
         let (volume, rules) = (&self.volume, self.rules);
         let (sections, near) = (&plan.sections, &plan.near);
-        format!("block 3 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
+        format!("block 4 {volume:?} {rules:?} {place:?} {sections:?} {near:?}")
     }
 
     /// Builds a block, as planned if it was.
@@ -580,8 +580,10 @@ fn cover(
     grid: &Grid,
     overlaps: Overlaps,
     mut uncovered: Uncovered,
-    candidates: Vec<Candidate>,
+    mut candidates: Vec<Candidate>,
 ) -> (Uncovered, Vec<Part>) {
+    // Sums of blended ones are rounded alike, whatever order the index has them in.
+    candidates.sort_unstable_by_key(|candidate| candidate.tile.age());
     let segments = uncovered.cover(grid, overlaps, &candidates);
     let parts = candidates.into_iter().zip(segments);
     let parts = parts.filter(|(_, segments)| !segments.is_empty());

@@ -160,14 +160,25 @@ impl Candidate {
         if min.cmpgt(size + 1.0).any() || max.cmplt(DVec2::splat(-1.0)).any() {
             return (None, false);
         }
-        let reach = interpolation.reach();
-        let (range, blanks) = self.image.range(self.level, min, max, reach);
+        let range = self
+            .image
+            .range(self.level, min, max, interpolation.reach());
         let range = range.map(|range| interpolation.bounds(range));
-        let holes = blanks && self.blanks_are_holes;
-        (range, !holes && corners.into_iter().all(inside))
+        let covers = corners.into_iter().all(inside);
+        if !self.blanks_are_holes {
+            return (range, covers);
+        }
+        let to_finest = f64::from(1_u32 << self.level);
+        let holes = self.image.holes();
+        let (some, all) = holes.map_or((false, false), |h| {
+            h.within(min * to_finest, max * to_finest)
+        });
+        // Where the level's pixels are rounded to 0 and something was acquired, samples are 1.
+        let range = range.or(Some((0, 0))).filter(|_| !all);
+        (range, !some && covers)
     }
 
-    /// Cuts a row where the tile's pixels are in blank sub-tiles; calls `keep` with the rest.
+    /// Cuts a row where the tile has holes; calls `keep` with the rest.
     fn without_blanks(
         &self,
         grid: &Grid,
@@ -175,12 +186,12 @@ impl Candidate {
         row: Range<u32>,
         mut keep: impl FnMut(Range<u32>),
     ) {
-        if !(self.blanks_are_holes && self.image.has_blanks(self.level)) {
+        let Some(holes) = self.image.holes().filter(|_| self.blanks_are_holes) else {
             return keep(row);
-        }
+        };
         let mut start = None;
         for x in row.clone() {
-            let seen = !self.image.is_blank_at(self.level, self.pixel(grid, x, y));
+            let seen = !holes.has(self.tile.position(grid.point(x, y)));
             match (seen, start) {
                 (true, None) => start = Some(x),
                 (false, Some(first)) => {
@@ -199,8 +210,7 @@ impl Candidate {
     fn compare(&self, other: &Self, point: DVec2) -> Ordering {
         let distance = |c: &Self| point.distance_squared(c.tile.centre);
         let nearer = distance(self).total_cmp(&distance(other));
-        let newer = other.tile.revision.cmp(&self.tile.revision);
-        nearer.then(newer).then(other.tile.id.cmp(&self.tile.id))
+        nearer.then(other.tile.age().cmp(&self.tile.age()))
     }
 
     /// The sub-tiles that the samples of these segments touch.

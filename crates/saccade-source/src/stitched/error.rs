@@ -23,7 +23,7 @@ pub enum StitchError {
     },
     /// A tile's pyramid is not there, and has not come for a while.
     #[error(
-        "the pyramid of a tile of section {section} is missing; `saccade check ARCHIVE --repair` has it made \
+        "the pyramid of a tile of section {section} is missing; `saccade check ARCHIVE --repair --acquisition FOLDER` has it made \
          anew: {name}"
     )]
     Missing {
@@ -61,7 +61,7 @@ pub enum StitchError {
     },
     /// A tile's pyramid is that of another tile.
     #[error(
-        "the pyramid was made for another tile; `saccade check ARCHIVE --repair` has it made anew: {name}"
+        "the pyramid was made for another tile; `saccade check ARCHIVE --repair --acquisition FOLDER` has it made anew: {name}"
     )]
     Mistaken {
         /// The file.
@@ -94,7 +94,7 @@ impl StitchError {
                 section,
             } => match source {
                 StorageError::NotFound { .. } => format!(
-                    "the pyramid of a tile of section {section} is missing; `saccade check ARCHIVE --repair` \
+                    "the pyramid of a tile of section {section} is missing; `saccade check ARCHIVE --repair --acquisition FOLDER` \
                      has it made anew: {name}"
                 ),
                 other => format!("{self}: {}: {name}", other.without_place()),

@@ -194,15 +194,16 @@ impl TileIndex {
         let loading = |z: u32, s: &Section| changed.contains_key(&z) && !s.cell.initialized();
         lock(&self.sections).retain(|z, section| !loading(z, section));
         let forget = || lock(&self.sections).retain(|z, _| !changed.contains_key(&z));
-        let mut now = BTreeMap::new();
-        for &z in changed.keys() {
-            let within = z..z.saturating_add(1);
+        let mut now: BTreeMap<u32, Vec<bool>> = BTreeMap::new();
+        for within in runs(changed.keys().copied()) {
             let of = self
                 .catalog
-                .sections_of_channels(&self.volume, self.channels, within);
+                .sections_of_channels(&self.volume, self.channels, within.clone());
             let of = of.await.inspect_err(|_| forget())?;
-            let has: Vec<bool> = of.iter().map(|sections| !sections.is_empty()).collect();
-            now.insert(z, has);
+            for (z, _) in changed.range(within) {
+                let has = of.iter().map(|sections| sections.binary_search(z).is_ok());
+                now.insert(*z, has.collect());
+            }
         }
         let ids: BTreeSet<TileId> = changed.values().flatten().copied().collect();
         let ids: Vec<_> = ids.into_iter().collect();
@@ -303,6 +304,21 @@ impl TileIndex {
         let entries = 2 * sections.by_number.len() * each;
         (size_of::<Self>() + entries + acquired) as u64 + sections.bytes
     }
+}
+
+/// The ranges that hold these ascending sections, and few others: a registration changes all sections, and is to cost few questions.
+fn runs(sections: impl IntoIterator<Item = u32>) -> Vec<Range<u32>> {
+    /// Sections between two of which one question is asked.
+    const NEAR: u32 = 64;
+    let mut runs: Vec<Range<u32>> = Vec::new();
+    for section in sections {
+        let end = section.saturating_add(1);
+        match runs.last_mut() {
+            Some(run) if section - run.end <= NEAR => run.end = end,
+            _ => runs.push(section..end),
+        }
+    }
+    runs
 }
 
 /// Every change under these locks is one insertion or removal: whole even after a panic.

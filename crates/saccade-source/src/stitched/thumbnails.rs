@@ -14,6 +14,7 @@ use glam::UVec2;
 use saccade_archive::pyramid::{PyramidLevel, SUB_TILE_EDGE, SUB_TILE_VOXELS};
 use saccade_core::volume::Dtype;
 
+use super::holes::Holes;
 use super::tiles::Fetched;
 
 /// The one sub-tile of a pyramid's coarsest level, decoded.
@@ -22,6 +23,8 @@ pub(super) struct Thumbnail {
     size: UVec2,
     min: u16,
     max: u16,
+    /// Of the whole pyramid.
+    holes: Option<Holes>,
     /// Little-endian; none where all pixels have one value.
     voxels: Bytes,
 }
@@ -29,11 +32,17 @@ pub(super) struct Thumbnail {
 impl Thumbnail {
     /// Of `size` pixels with values from `min` to `max`; `voxels` are those of a whole sub-tile, padding
     /// included, and none where `min` is `max`: 0 if it is blank.
-    pub(super) fn new(size: UVec2, (min, max): (u16, u16), voxels: Bytes) -> Self {
+    pub(super) fn new(
+        size: UVec2,
+        (min, max): (u16, u16),
+        holes: Option<Holes>,
+        voxels: Bytes,
+    ) -> Self {
         Self {
             size,
             min,
             max,
+            holes,
             voxels,
         }
     }
@@ -48,6 +57,11 @@ impl Thumbnail {
 
     pub(super) fn is_blank(&self) -> bool {
         self.max == 0
+    }
+
+    /// Where its pyramid is blank, if it is anywhere.
+    pub(super) fn holes(&self) -> Option<&Holes> {
+        self.holes.as_ref()
     }
 
     /// Bounds of its values; `None` if it is blank.
@@ -67,16 +81,17 @@ impl Thumbnail {
 
     /// Memory it takes \[bytes\].
     pub(super) fn memory(&self) -> usize {
-        size_of::<Self>() + self.voxels.len()
+        size_of::<Self>() + self.voxels.len() + self.holes.as_ref().map_or(0, Holes::memory)
     }
 
     /// For [`Self::from_bytes`].
     pub(super) fn to_bytes(&self) -> Bytes {
-        let mut bytes = BytesMut::with_capacity(12 + self.voxels.len());
+        let mut bytes = BytesMut::with_capacity(20 + self.memory());
         bytes.put_u32_le(self.size.x);
         bytes.put_u32_le(self.size.y);
         bytes.put_u16_le(self.min);
         bytes.put_u16_le(self.max);
+        Holes::put(self.holes(), &mut bytes);
         bytes.put_slice(&self.voxels);
         bytes.freeze()
     }
@@ -96,12 +111,13 @@ impl Thumbnail {
         if !can_be {
             return None;
         }
+        let holes = Holes::take(&mut bytes)?;
         let voxels = if min == max {
             0
         } else {
             SUB_TILE_VOXELS * dtype.bytes()
         };
-        (bytes.len() == voxels).then(|| Self::new(size, (min, max), bytes))
+        (bytes.len() == voxels).then(|| Self::new(size, (min, max), holes, bytes))
     }
 }
 
@@ -110,9 +126,12 @@ impl Thumbnail {
 pub(crate) fn fuzz(bytes: &[u8]) {
     let (head, value) = bytes.split_at(bytes.len().min(12));
     for dtype in [Dtype::Uint8, Dtype::Uint16] {
-        for fill in [0, SUB_TILE_VOXELS * dtype.bytes()] {
+        for (holes, fill) in [0, 1, 9, 40].into_iter().flat_map(|words| {
+            [0, SUB_TILE_VOXELS * dtype.bytes()].map(|fill| (8 + 8 * words, fill))
+        }) {
+            let (holes, value) = value.split_at(value.len().min(holes));
             let filled = value.iter().copied().cycle().take(fill);
-            let bytes: Bytes = head.iter().copied().chain(filled).collect();
+            let bytes: Bytes = head.iter().chain(holes).copied().chain(filled).collect();
             let Some(thumbnail) = Thumbnail::from_bytes(bytes.clone(), dtype) else {
                 continue;
             };
@@ -145,20 +164,30 @@ mod tests {
     fn bytes_are_a_thumbnail_or_none() {
         let size = UVec2::new(100, 70);
         let voxels = |bytes: usize| Bytes::from(vec![7; SUB_TILE_VOXELS * bytes]);
+        let mut holes = BytesMut::new();
+        for word in [3, 5, 0b0101, 0] {
+            holes.put_u32_le(word);
+        }
+        let holes = Holes::take(&mut holes.freeze()).unwrap();
+        assert!(holes.is_some());
+        let of = |range, holes: &Option<Holes>, voxels| {
+            Thumbnail::new(size, range, holes.clone(), voxels)
+        };
         for (thumbnail, dtype) in [
-            (Thumbnail::new(size, (3, 9), voxels(1)), Dtype::Uint8),
-            (Thumbnail::new(size, (3, 900), voxels(2)), Dtype::Uint16),
-            (Thumbnail::new(size, (177, 177), Bytes::new()), Dtype::Uint8),
-            (Thumbnail::new(size, (0, 0), Bytes::new()), Dtype::Uint16),
+            (of((3, 9), &None, voxels(1)), Dtype::Uint8),
+            (of((3, 900), &holes, voxels(2)), Dtype::Uint16),
+            (of((177, 177), &None, Bytes::new()), Dtype::Uint8),
+            (of((177, 177), &holes, Bytes::new()), Dtype::Uint8),
+            (of((0, 0), &holes, Bytes::new()), Dtype::Uint16),
         ] {
             let bytes = thumbnail.to_bytes();
-            for cut in [0, 3, 11, bytes.len() - 1] {
+            for cut in [0, 3, 11, 15, bytes.len() - 1] {
                 let cut = bytes.slice(..cut);
                 assert_eq!(Thumbnail::from_bytes(cut, dtype), None);
             }
             assert_eq!(Thumbnail::from_bytes(bytes, dtype), Some(thumbnail));
         }
-        let of_other_type = Thumbnail::new(size, (3, 9), voxels(1)).to_bytes();
+        let of_other_type = of((3, 9), &None, voxels(1)).to_bytes();
         assert_eq!(Thumbnail::from_bytes(of_other_type, Dtype::Uint16), None);
     }
 }

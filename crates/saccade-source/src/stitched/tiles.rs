@@ -7,6 +7,7 @@ use super::StitchedOptions;
 use super::damage::DamagedTiles;
 use super::disk_cache::DiskCache;
 use super::error::StitchError;
+use super::holes::Holes;
 use super::index::{IndexedTile, TileIndex};
 use super::thumbnails::Thumbnail;
 use bytes::Bytes;
@@ -30,40 +31,26 @@ pub(super) struct Pyramid {
     pub(super) index: PyramidIndex,
     /// Another each time one is opened.
     serial: u64,
-    /// Per level, whether a sub-tile is blank.
-    blanks: Vec<bool>,
+    holes: Option<Holes>,
 }
 
 impl Pyramid {
     fn new(index: PyramidIndex, serial: u64) -> Self {
-        let levels = index.levels().iter().enumerate();
-        let blanks = levels.map(|(level, size)| {
-            let rows = (0..size.sub_tiles.y).map(|y| (y, 0..size.sub_tiles.x));
-            let mut all = rows.flat_map(|(y, xs)| xs.map(move |x| (x, y)));
-            all.any(|(x, y)| index.sub_tile(level, x, y).is_none_or(|e| e.is_blank()))
-        });
-        let blanks = blanks.collect();
         Self {
+            holes: Holes::of(&index),
             index,
             serial,
-            blanks,
         }
     }
 
-    pub(super) fn has_blanks(&self, level: u32) -> bool {
-        self.blanks[level as usize]
+    /// Memory it takes \[bytes\].
+    fn memory(&self) -> usize {
+        self.index.memory() + self.holes.as_ref().map_or(0, Holes::memory)
     }
 
-    /// Smallest and largest value of the sub-tiles that a rectangle \[pixels of the level\] touches,
-    /// blank ones left out, and whether there are such; `None` if all are blank.
-    /// The interpolation reaches over `reach` pixels.
-    pub(super) fn range(
-        &self,
-        level: u32,
-        min: DVec2,
-        max: DVec2,
-        reach: f64,
-    ) -> (Option<(u16, u16)>, bool) {
+    /// Smallest and largest value of the sub-tiles that a rectangle \[pixels of the level\] touches; `None` if all are
+    /// blank. The interpolation reaches over `reach` pixels.
+    fn range(&self, level: u32, min: DVec2, max: DVec2, reach: f64) -> Option<(u16, u16)> {
         let size = self.index.levels()[level as usize];
         let last = UVec2::new(size.width - 1, size.height - 1).as_dvec2();
         // Between the centres of pixels in each direction.
@@ -88,16 +75,7 @@ impl Pyramid {
             // Beside a blank sub-tile, values fall off to 0.
             range = range.map(|(_, most)| (0, most));
         }
-        (range, blanks)
-    }
-
-    /// Whether a position \[pixels of the level\] is in a blank sub-tile.
-    pub(super) fn is_blank_at(&self, level: u32, pixel: DVec2) -> bool {
-        let size = self.index.levels()[level as usize];
-        let last = UVec2::new(size.width - 1, size.height - 1);
-        let at = pixel.max(DVec2::ZERO).as_uvec2().min(last) / SUB_TILE_EDGE;
-        let entry = self.index.sub_tile(level as usize, at.x, at.y);
-        entry.is_none_or(|e| e.is_blank())
+        range
     }
 }
 
@@ -134,18 +112,11 @@ impl Image {
         }
     }
 
-    pub(super) fn has_blanks(&self, level: u32) -> bool {
+    /// Where it is blank, if it is anywhere.
+    pub(super) fn holes(&self) -> Option<&Holes> {
         match self {
-            Self::Pyramid(pyramid) => pyramid.has_blanks(level),
-            Self::Thumbnail(thumbnail) => thumbnail.is_blank(),
-        }
-    }
-
-    /// Whether a position \[pixels of the level\] is in a blank sub-tile.
-    pub(super) fn is_blank_at(&self, level: u32, pixel: DVec2) -> bool {
-        match self {
-            Self::Pyramid(pyramid) => pyramid.is_blank_at(level, pixel),
-            Self::Thumbnail(thumbnail) => thumbnail.is_blank(),
+            Self::Pyramid(pyramid) => pyramid.holes.as_ref(),
+            Self::Thumbnail(thumbnail) => thumbnail.holes(),
         }
     }
 
@@ -156,10 +127,10 @@ impl Image {
         min: DVec2,
         max: DVec2,
         reach: f64,
-    ) -> (Option<(u16, u16)>, bool) {
+    ) -> Option<(u16, u16)> {
         match self {
             Self::Pyramid(pyramid) => pyramid.range(level, min, max, reach),
-            Self::Thumbnail(thumbnail) => (thumbnail.range(), thumbnail.is_blank()),
+            Self::Thumbnail(thumbnail) => thumbnail.range(),
         }
     }
 }
@@ -187,7 +158,7 @@ impl Weighter<Box<str>, Arc<Thumbnail>> for Bytewise {
 
 impl Weighter<Box<str>, Arc<Pyramid>> for Bytewise {
     fn weight(&self, name: &Box<str>, pyramid: &Arc<Pyramid>) -> u64 {
-        (pyramid.index.memory() + name.len() + 64) as u64
+        (pyramid.memory() + name.len() + 64) as u64
     }
 }
 
@@ -336,7 +307,7 @@ impl Tiles {
     async fn thumbnail(&self, tile: &IndexedTile) -> Result<Arc<Thumbnail>, StitchError> {
         let kept = self.disk.as_ref().map(|(disk, identity)| {
             let (name, size, dtype) = (&tile.pyramid, tile.size, self.dtype);
-            let description = format!("thumbnail 1 {name:?} {size:?} {dtype:?}");
+            let description = format!("thumbnail 2 {name:?} {size:?} {dtype:?}");
             (disk, [identity, description.as_bytes()].concat())
         });
         if let Some((disk, description)) = &kept
@@ -366,7 +337,7 @@ impl Tiles {
             let (_, fetched) = fetched.pop().expect("it is not blank");
             self.decode(tile.section, level, UVec2::ZERO, fetched)?
         };
-        let thumbnail = Thumbnail::new(size, range, voxels);
+        let thumbnail = Thumbnail::new(size, range, pyramid.holes.clone(), voxels);
         if let Some((disk, description)) = &kept {
             disk.put(description, &thumbnail.to_bytes());
         }

@@ -7,7 +7,7 @@ use saccade_archive::catalog::{Catalog, NewTile, Tile, TileId};
 use saccade_core::transform::{SectionFromTile, SectionPoint};
 use saccade_core::volume::Volume;
 
-use super::{SectionIndex, TileIndex, TileUpdate};
+use super::{SectionIndex, TileIndex, TileUpdate, runs};
 use crate::stitched::along_z::{AlongZ, Gaps, Reaches};
 
 /// Where nothing is filled and no level is coarse.
@@ -27,6 +27,7 @@ fn tile(n: u32, size: UVec2, turn: f64, corner: DVec2) -> Tile {
         transform: SectionFromTile::rotated(size.as_dvec2(), turn, corner),
         pyramid: format!("tiles/section0003/section0003_tile{n:06}-0123456789abcdef.tif"),
         revision: 1,
+        position: 0,
     }
 }
 
@@ -547,4 +548,15 @@ async fn memory_is_bounded_and_what_is_used_stays() {
     index.apply(&changes, &OWN).await.unwrap();
     let near = index.section(3).await.unwrap().near(0, ALL.0.0, ALL.1.0);
     assert!(near[0].min.x > 400.0, "{near:?}");
+}
+
+#[test]
+fn neighbouring_sections_are_asked_for_at_once() {
+    assert_eq!(runs([]), []);
+    let all = 0..20_000;
+    assert_eq!(runs(all.clone()), [all]);
+    assert_eq!(
+        runs([3, 4, 69, 135, u32::MAX - 1]),
+        [3..70, 135..136, u32::MAX - 1..u32::MAX]
+    );
 }

@@ -11,6 +11,8 @@ pub(super) const PER_ALLOCATION: usize = 16;
 pub(in crate::stitched) struct IndexedTile {
     pub(in crate::stitched) id: TileId,
     pub(in crate::stitched) revision: u64,
+    /// Position of its image's record: which of two images is newer.
+    pub(in crate::stitched) recorded: u64,
     pub(in crate::stitched) section: u32,
     pub(in crate::stitched) channel: u32,
     /// Pixels of level 0.
@@ -32,6 +34,7 @@ impl IndexedTile {
         Self {
             id: tile.id,
             revision: tile.revision,
+            recorded: tile.position,
             section: tile.section,
             channel: tile.channel,
             size: tile.size,
@@ -50,6 +53,12 @@ impl IndexedTile {
             self.tile_from_section.along_y(),
         );
         x.perp_dot(y).abs()
+    }
+
+    /// What tells it from all others of its volume, the newer image's larger. Who enters an acquisition once more, with other
+    /// workers or in other steps, gets the same order.
+    pub(in crate::stitched) fn age(&self) -> (u64, TileId) {
+        (self.recorded, self.id)
     }
 
     /// The position in the tile \[pixels of level 0\] of a position in the section.

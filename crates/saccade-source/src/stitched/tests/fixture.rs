@@ -79,9 +79,14 @@ impl Fixture {
     }
 
     /// Enters a tile, new or again, as ingest does. Returns the name of its pyramid.
-    pub(super) async fn put(&mut self, name: &str, mut tile: RawTile) -> String {
+    pub(super) async fn put(&mut self, name: &str, tile: RawTile) -> String {
+        self.put_at(name, tile, self.changes + 1).await
+    }
+
+    /// The same of the record at a position, however late it comes.
+    pub(super) async fn put_at(&mut self, name: &str, mut tile: RawTile, position: u64) -> String {
         self.changes += 1;
-        tile.age = self.changes;
+        tile.age = position;
         let size = UVec2::new(tile.width as u32, tile.height as u32);
         let pyramid = format!("tiles/{name}-{}.tif", self.changes);
         let bytes = match self.volume.dtype {
@@ -99,7 +104,7 @@ impl Fixture {
             size,
             transform: SectionFromTile::new(tile.transform).unwrap(),
             pyramid: pyramid.clone(),
-            position: self.changes,
+            position,
         };
         self.archive.catalog().commit_tile("v", &new).await.unwrap();
         let entered = self
@@ -126,7 +131,7 @@ impl Fixture {
         commit.finish().await.unwrap();
         let id = catalog.tile("v", name).await.unwrap().unwrap().id.0;
         let tile = self.tiles.get_mut(&id).unwrap();
-        (tile.transform, tile.age) = (transform, self.changes);
+        tile.transform = transform;
     }
 
     /// Moves all tiles of a section by as much, at once.
@@ -140,7 +145,7 @@ impl Fixture {
             let name = &tile.name;
             { commit.transform(name, moved, Some(self.changes)).await }.unwrap();
             let known = self.tiles.get_mut(&tile.id.0).unwrap();
-            (known.transform, known.age) = (moved.elements(), self.changes);
+            known.transform = moved.elements();
         }
         commit.finish().await.unwrap();
     }

@@ -8,7 +8,9 @@ use saccade_archive::storage::MemoryStorage;
 use saccade_core::volume::{Dtype, Volume};
 use saccade_core::voxel_box::VoxelBox;
 
-use super::fixture::{Fixture, chunk_of, difference, expected_as, read_all, read_channel, tile};
+use super::fixture::{
+    Fixture, Levels, chunk_of, difference, expected_as, read_all, read_channel, tile,
+};
 use super::oracle::{Between, How, RawTile};
 use super::run;
 use crate::stitched::{AlongZ, Interpolation, Overlaps, StitchedOptions};
@@ -116,6 +118,32 @@ fn every_choice_equals_brute_force_and_no_other() {
     });
 }
 
+/// Bounds are asked for before anything is built; how many are close, and how many there are.
+async fn check_ranges(fixture: &Fixture, options: StitchedOptions, got: &Levels) -> (u32, u32) {
+    let (volume, unread) = (&fixture.volume, fixture.open_with(options).await);
+    let (mut tight, mut all) = (0, 0);
+    for level in 0..volume.levels.len() as u32 {
+        let chunks = volume.chunks(level as usize);
+        for chunk in VoxelBox::of_size(chunks).iter() {
+            let id = ChunkId {
+                channel: 0,
+                level,
+                chunk,
+            };
+            let found = unread.find_value_range(id).await.unwrap();
+            let values = chunk_of(volume, got, id);
+            let values = values.into_iter().filter(|v| *v != 0).map(u16::from);
+            for value in values {
+                let found = found.unwrap();
+                assert!(found.min <= value && value <= found.max, "{id} {found:?}");
+            }
+            all += 1;
+            tight += u32::from(found.is_none_or(|r| r.max - r.min < 150));
+        }
+    }
+    (tight, all)
+}
+
 #[test]
 fn bounds_hold_for_every_choice() {
     run(async {
@@ -157,29 +185,129 @@ fn bounds_hold_for_every_choice() {
                 let want = expected_as(&volume, &fixture.tiles, how);
                 let (coverage, most) = difference(&got, &want);
                 assert!(coverage == 0 && most <= 1, "{options:?}: {most}");
-                let unread = fixture.open_with(options.clone()).await;
-                let (mut tight, mut all) = (0, 0);
-                for level in 0..volume.levels.len() as u32 {
-                    let chunks = volume.chunks(level as usize);
-                    for chunk in VoxelBox::of_size(chunks).iter() {
-                        let id = ChunkId {
-                            channel: 0,
-                            level,
-                            chunk,
-                        };
-                        let found = unread.find_value_range(id).await.unwrap();
-                        let values = chunk_of(&volume, &got, id);
-                        let values = values.into_iter().filter(|v| *v != 0).map(u16::from);
-                        for value in values {
-                            let found = found.unwrap();
-                            assert!(found.min <= value && value <= found.max, "{id} {found:?}");
-                        }
-                        all += 1;
-                        tight += u32::from(found.is_none_or(|r| r.max - r.min < 150));
-                    }
-                }
+                let (tight, all) = check_ranges(&fixture, options, &got).await;
                 assert!(tight > 0 && all > tight, "{tight} of {all}");
             }
+        }
+    });
+}
+
+/// Several workers enter tiles in the order in which they get ready.
+#[test]
+fn what_is_seen_does_not_depend_on_who_came_first() {
+    run(async {
+        const TILES: usize = 5;
+        let blend = StitchedOptions {
+            overlaps: Overlaps::Blend,
+            ..StitchedOptions::default()
+        };
+        let choices = [StitchedOptions::default(), blend];
+        let mut seen: Vec<Vec<_>> = vec![Vec::new(); choices.len()];
+        for turn in 0..TILES {
+            let mut fixture =
+                Fixture::new(UVec3::new(150, 140, 2), DVec3::new(4.0, 4.0, 9.0)).await;
+            for n in (0..TILES).map(|n| (n + turn) % TILES) {
+                // All about one centre: none is nearer.
+                let tile = tile((131, 121), 1, (7.0, 3.0), 0.0, 1.0, n as u64 + 1);
+                // Before all moves.
+                fixture.put_at(&format!("t{n}"), tile, n as u64).await;
+            }
+            for (options, seen) in choices.iter().zip(&mut seen) {
+                let levels = read_all(&fixture.open_with(options.clone()).await).await;
+                seen.push(levels);
+            }
+            // Nor on who was moved, and back.
+            let at = fixture.tiles.values().next().unwrap().transform;
+            let mut away = at;
+            away[4] += 40.0;
+            for (name, hides) in [("t1", false), ("t4", true)] {
+                fixture.transform(name, away).await;
+                let moved = read_all(&fixture.open().await).await;
+                assert!(
+                    !hides || moved != seen[0][turn],
+                    "{name} has hidden nothing"
+                );
+                fixture.transform(name, at).await;
+            }
+            let back = read_all(&fixture.open().await).await;
+            assert!(back == seen[0][turn], "{turn}");
+            let (coverage, most) = difference(&back, &fixture.expected());
+            assert!(coverage == 0 && most <= 1, "{turn}: {coverage} {most}");
+        }
+        for seen in &seen {
+            assert!(seen.iter().all(|levels| *levels == seen[0]));
+        }
+        assert!(seen[0][0] != seen[1][0], "blended");
+    });
+}
+
+/// An image that was turned is black beside what was imaged, at its finest level in whole squares.
+#[test]
+fn what_is_seen_through_holes_is_seen_at_every_level() {
+    run(async {
+        const EDGE: usize = 700;
+        let mut fixture = Fixture::new(UVec3::new(740, 720, 2), DVec3::new(4.0, 4.0, 9.0)).await;
+        let mut overview = tile((190, 190), 0, (0.0, 0.0), 0.0, 1.0, 1);
+        overview.pixels.fill(200);
+        overview.transform = [4.0, 0.0, 0.0, 4.0, -3.0, -2.0];
+        let mut region = tile((EDGE, EDGE), 0, (10.0, 6.0), 0.0, 1.0, 2);
+        let mut fill = |column: usize, row: usize, value: u16| {
+            for y in row * 128..((row + 1) * 128).min(EDGE) {
+                region.pixels[y * EDGE..][column * 128..((column + 1) * 128).min(EDGE)].fill(value);
+            }
+        };
+        for hole in [(1, 1), (2, 3), (5, 5)] {
+            fill(hole.0, hole.1, 0);
+        }
+        // Dark, and no hole: at coarse levels it is rounded to 0.
+        fill(4, 1, 0);
+        for pixel in [(600, 200), (530, 140)] {
+            region.pixels[pixel.1 * EDGE + pixel.0] = 1;
+        }
+        fixture.put("overview", overview).await;
+        fixture.put("region", region).await;
+        for overlaps in [Overlaps::NearestCentre, Overlaps::Blend] {
+            let options = StitchedOptions {
+                overlaps,
+                ..StitchedOptions::default()
+            };
+            let got = read_all(&fixture.open_with(options.clone()).await).await;
+            let how = How {
+                blend: overlaps == Overlaps::Blend,
+                ..How::PLAIN
+            };
+            let want = expected_as(&fixture.volume, &fixture.tiles, how);
+            let (coverage, most) = difference(&got, &want);
+            assert!(coverage == 0 && most <= 1, "{coverage} {most}");
+            let mut looked_at = 0;
+            for (level, voxels) in fixture.volume.levels.iter().zip(&got) {
+                let at = |x: f64, y: f64| {
+                    let voxel = (DVec3::new(x, y, 0.5) / level.downsampling).as_usizevec3();
+                    let extent = level.extent.as_usizevec3();
+                    voxels[voxel.y * extent.x + voxel.x]
+                };
+                // Where a voxel lies within the hole, with its neighbours.
+                if level.downsampling.x <= 16.0 {
+                    assert_eq!(at(10.0 + 192.0, 6.0 + 192.0), 200, "level {level:?}");
+                    assert_eq!(at(10.0 + 320.0, 6.0 + 448.0), 200, "level {level:?}");
+                    assert_eq!(at(10.0 + 576.0, 6.0 + 192.0), 1, "level {level:?}");
+                    looked_at += 1;
+                }
+            }
+            assert!(looked_at > 2, "{looked_at} levels");
+            check_ranges(&fixture, options, &got).await;
+        }
+        // Without its holes it is another picture, also at coarse levels.
+        let mut tiles = fixture.tiles.clone();
+        let region = tiles.values_mut().find(|tile| tile.width == EDGE).unwrap();
+        region
+            .pixels
+            .iter_mut()
+            .for_each(|value| *value = (*value).max(1));
+        let other = super::fixture::expected(&fixture.volume, &tiles);
+        let want = fixture.expected();
+        for (want, other) in want.iter().zip(other).skip(1).take(3) {
+            assert!(want.iter().zip(&other).any(|(a, b)| a.abs_diff(*b) > 100));
         }
     });
 }
@@ -368,11 +496,7 @@ fn sixteen_bits_are_exact() {
 }
 
 /// The bytes are little-endian, and ranges those of the values.
-async fn check_bytes(
-    source: &crate::stitched::StitchedSource,
-    fixture: &Fixture,
-    levels: &super::fixture::Levels,
-) {
+async fn check_bytes(source: &crate::stitched::StitchedSource, fixture: &Fixture, levels: &Levels) {
     let id = ChunkId {
         channel: 0,
         level: 0,

@@ -12,7 +12,7 @@ pub(super) struct RawTile {
     pub(super) transform: [f64; 6],
     pub(super) section: u32,
     pub(super) channel: u32,
-    /// Larger for what changed later.
+    /// Larger for an image that was recorded later.
     pub(super) age: u64,
 }
 
@@ -215,7 +215,7 @@ pub(super) fn stitch(
             let (w, h) = (tile.width as f64, tile.height as f64);
             let inside = u >= 0.0 && v >= 0.0 && u < w && v < h;
             let level = &levels[**id][level_of(tile, by)];
-            if !inside || level.is_blank(u / level.f, v / level.f) {
+            if !inside || levels[**id][0].is_blank(u, v) {
                 continue;
             }
             let size = 1.0 / tile.pixels_per_voxel();
