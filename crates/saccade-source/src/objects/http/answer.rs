@@ -7,6 +7,7 @@ use futures::StreamExt as _;
 use reqwest::{Response, StatusCode, header};
 
 use super::chain;
+use super::platform::DECODES;
 use crate::objects::error::Failure;
 use crate::objects::retry::Pace;
 use crate::objects::transport::{BEGINNING, begins_a_page, names_a_page, page, plain};
@@ -26,8 +27,7 @@ pub(super) async fn read(
 ) -> Result<Bytes, Failure> {
     let text = |name| answer.headers().get(name)?.to_str().ok().map(str::to_owned);
     let names_a_page = text(header::CONTENT_TYPE).is_some_and(|media| names_a_page(&media));
-    // Browsers have decoded it.
-    let encoding = text(header::CONTENT_ENCODING).filter(|_| !cfg!(target_family = "wasm"));
+    let encoding = text(header::CONTENT_ENCODING).filter(|_| !DECODES);
     let mut beginning = Vec::new();
     let bytes = read_part(answer, part, patience, location, &mut beginning).await;
     match &bytes {
@@ -109,10 +109,7 @@ async fn read_part(
         }
     };
     let encoded = answer.headers().contains_key(header::CONTENT_ENCODING);
-    // Browsers decode what is encoded, but tell its encoded length.
-    let told = answer
-        .content_length()
-        .filter(|_| !(encoded && cfg!(target_family = "wasm")));
+    let told = answer.content_length().filter(|_| !(encoded && DECODES));
     let cut_by_us = matches!(part, Part::Range(_)) && !partial;
     let too_long = || {
         Failure::Final(ObjectError::TooLong {

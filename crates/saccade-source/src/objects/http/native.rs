@@ -7,6 +7,9 @@ use crate::objects::error::Failure;
 /// The last bytes can be asked for as such.
 pub(super) const SUFFIXES: bool = true;
 
+/// What is encoded arrives as it was sent.
+pub(super) const DECODES: bool = false;
+
 /// Follows a server to another place of its own, not to others.
 pub(super) fn client() -> Client {
     saccade_archive::tls::provide();

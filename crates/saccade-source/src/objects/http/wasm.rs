@@ -10,6 +10,9 @@ use crate::objects::error::Failure;
 /// A range from a known byte needs none.
 pub(super) const SUFFIXES: bool = false;
 
+/// Browsers have decoded what is encoded, but tell its encoded length.
+pub(super) const DECODES: bool = true;
+
 /// The browser's own, with its own rules.
 pub(super) fn client() -> Client {
     Client::new()
