@@ -6,26 +6,40 @@ use std::path::{Path, PathBuf};
 
 use glam::DVec2;
 use saccade_archive::VisualizationArchive;
-use saccade_archive::catalog::Tile;
+use saccade_archive::catalog::{Catalog, Tile};
 use serde_json::json;
 
 use super::errors::text;
 use super::kills::{Killer, image, tree};
 use super::{done, simulate, stderr};
 
-/// The tiles of the catalog.
-fn tiles(archive: &Path) -> Vec<Tile> {
+/// What the archive's catalog says.
+fn asked<T>(archive: &Path, question: impl AsyncFnOnce(&Catalog) -> T) -> T {
     let runtime = tokio::runtime::Builder::new_current_thread();
     let runtime = { runtime }.enable_all().build().unwrap();
     runtime.block_on(async {
         let archive = VisualizationArchive::open(archive).await.unwrap();
-        let catalog = archive.catalog();
+        let answer = question(archive.catalog()).await;
+        archive.catalog().close().await;
+        answer
+    })
+}
+
+fn tiles(archive: &Path) -> Vec<Tile> {
+    asked(archive, async |catalog| {
         let mut tiles = Vec::new();
         for section in catalog.sections_of_tiles("phantom").await.unwrap() {
             tiles.extend(catalog.section_tiles("phantom", section).await.unwrap());
         }
-        catalog.close().await;
         tiles
+    })
+}
+
+/// How many tiles wait for ingest.
+fn given_back(archive: &Path) -> u64 {
+    asked(archive, async |catalog| {
+        let statistics = catalog.statistics("phantom").await.unwrap();
+        statistics.waiting + statistics.queued
     })
 }
 
@@ -35,13 +49,21 @@ fn place(tile: &Tile) -> DVec2 {
     DVec2::new(x, y)
 }
 
-/// Voxels of the finest level, without its description, which says the revision. In coarser ones voxels may be equally near two centres, of which the tile counts that came first.
+/// Voxels of all levels, without the descriptions, which say the revision.
 pub(super) fn exported(archive: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let out = archive.with_extension("zarr");
     done(["export", text(archive), text(&out)]);
     let mut files = image(tree(&out));
     fs::remove_dir_all(out).unwrap();
-    files.retain(|file, _| file.starts_with("0/c"));
+    files.retain(|file, _| {
+        file.components()
+            .nth(1)
+            .is_some_and(|part| part.as_os_str() == "c")
+    });
+    assert!(
+        files.keys().any(|file| !file.starts_with("0")),
+        "no coarse levels"
+    );
     assert!(!files.is_empty(), "no voxels are exported");
     files
 }
@@ -131,7 +153,10 @@ fn a_killed_repair_makes_nothing_worse_and_goes_on() {
     let want = exported(&archive);
     let pyramids = || -> Vec<_> {
         let names = tree(&archive.join("tiles")).into_keys();
-        names.map(|name| archive.join("tiles").join(name)).collect()
+        let pyramids = names.filter(|name| name.extension().is_some_and(|end| end == "tif"));
+        pyramids
+            .map(|name| archive.join("tiles").join(name))
+            .collect()
     };
     let damage = || {
         let whole = pyramids();
@@ -146,8 +171,10 @@ fn a_killed_repair_makes_nothing_worse_and_goes_on() {
                 _ => {}
             }
         }
-        let kept = whole.into_iter().enumerate().filter(|(n, _)| n % 5 > 1);
-        kept.map(|(_, pyramid)| pyramid).collect::<Vec<_>>()
+        let (kept, gone): (Vec<_>, Vec<_>) =
+            { whole.into_iter().enumerate() }.partition(|(n, _)| n % 5 > 1);
+        let kept: Vec<_> = kept.into_iter().map(|(_, pyramid)| pyramid).collect();
+        (kept, gone.len() as u64)
     };
     let repair = [
         "check",
@@ -156,10 +183,18 @@ fn a_killed_repair_makes_nothing_worse_and_goes_on() {
         "--acquisition",
         text(&acquisition),
     ];
-    let mut kept = damage();
+    let (mut kept, mut damaged) = damage();
     let mut killer = Killer::new(0x5acc_0005);
-    while killer.goes_on(1) {
+    let mut in_the_midst = 0;
+    while killer.goes_on(in_the_midst) {
+        let before = given_back(&archive);
         let killed = killer.life(&repair);
+        let now = given_back(&archive);
+        if killed && now == before {
+            killer.was_early();
+        }
+        // Of those that it has to give back to ingest some were, and others were not.
+        in_the_midst += u32::from(killed && now > before && now < damaged);
         let all = pyramids();
         assert!(
             kept.iter().all(|pyramid| all.contains(pyramid)),
@@ -168,9 +203,10 @@ fn a_killed_repair_makes_nothing_worse_and_goes_on() {
         if !killed {
             done(ingest);
             assert!(exported(&archive) == want, "other voxels");
-            kept = damage();
+            (kept, damaged) = damage();
         }
     }
+    assert!(in_the_midst > 0, "no kill came in the midst of a repair");
     done(repair);
     done(ingest);
     let whole = stderr(&done([
