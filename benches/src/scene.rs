@@ -158,7 +158,8 @@ impl Mosaic {
                     microscope.write_image(&tile, self.edge, &pixels)?;
                     let corner = DVec2::new(f64::from(x), f64::from(y)) * f64::from(self.pitch())
                         - f64::from(self.edge) / 20.0;
-                    let turned = 0.01 * (f64::from(x + 2 * y + section) - 1.5);
+                    // By up to 3 degrees: turned further, they would leave corners out.
+                    let turned = 0.01 * (f64::from(x + 2 * y + section % 4) - 1.5);
                     let size = DVec2::splat(f64::from(self.edge));
                     let transform = SectionFromTile::rotated(size, turned, corner);
                     microscope.announce(&tile, section, self.edge, transform)?;

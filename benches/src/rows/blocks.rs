@@ -83,7 +83,7 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
         .setting(
             "tiles",
             format!(
-                "{} of {}x{}, a tenth overlapping, turned by up to 2 degrees",
+                "{} of {}x{}, a tenth overlapping, turned by up to 3 degrees",
                 MOSAIC.tiles(),
                 MOSAIC.edge,
                 MOSAIC.edge

@@ -82,7 +82,7 @@ pub(crate) fn measure() -> Result<Vec<Row>> {
         Row::new(id, "Mvoxel per core and second", runs)
             .peer(27.8, "Hadwiger et al. 2012, table 3: 512x512 in 9.42 ms at level 0, whole machine of 12 cores, stitching on its GPU")
             .setting("volume", format!("{}x{}x{}, level 0", extent.x, extent.y, extent.z))
-            .setting("tiles", format!("{} of {}x{}, a tenth overlapping, turned by up to 2 degrees", MOSAIC.tiles(), MOSAIC.edge, MOSAIC.edge))
+            .setting("tiles", format!("{} of {}x{}, a tenth overlapping, turned by up to 3 degrees", MOSAIC.tiles(), MOSAIC.edge, MOSAIC.edge))
             .setting("caches", format!("source newly opened; files {files}"))
             .setting("requests at once", AT_ONCE)
             .setting("wall clock", format!("{rate:.0} Mvoxel/s on all cores"))
