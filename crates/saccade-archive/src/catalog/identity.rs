@@ -209,12 +209,17 @@ impl Catalog {
     }
 
     /// What went wrong, once it was looked what the file is now: who reads one while another is copied over it, or right after,
-    /// finds half of each, and takes it for damaged.
+    /// finds half of each, or nothing yet, and takes it for damaged, or for something else.
     pub async fn look_again(&self, error: CatalogError) -> CatalogError {
         /// Looks, and the pause after each: a copy may be under way.
         const LOOKS: u32 = 10;
         const PAUSE: Duration = Duration::from_millis(50);
-        if !matches!(error, CatalogError::Damaged { .. }) {
+        if !matches!(
+            error,
+            CatalogError::Damaged { .. }
+                | CatalogError::NotACatalog { .. }
+                | CatalogError::NoTable { .. }
+        ) {
             return error;
         }
         for _ in 0..LOOKS {
