@@ -19,6 +19,7 @@ use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
 use crate::storage::{Entry, StorageError};
 
+mod called;
 mod cursor;
 mod described;
 mod half_deleted;
@@ -107,7 +108,7 @@ pub enum CheckError {
 /// [`CheckOptions::repair`] its indexes are made anew, and where it is sound then, the rest follows.
 ///
 /// Where the records are at hand, the catalog is held against them: a tile that it lacks, or of which it says something else
-/// than the record, is found, and given back to ingest if that is wanted; one that lies elsewhere than its newest record says is moved
+/// than the record, is found, and given back to ingest if that is wanted; one that has another tile's name is called as its record is; one that lies elsewhere than its newest record says is moved
 /// there, unless somebody may have moved it since. So are what the catalog says of the volume, and of how far its records were read.
 /// A tile that the catalog lost is taken in again, be it that somebody other than the microscope had deleted it: nothing tells.
 /// A row that is called deleted and that no deletion took is brought back, and one that a deletion took and is there is taken
@@ -165,6 +166,7 @@ pub async fn check(
         history: History::default(),
         of_others: HashSet::new(),
         renamed: HashSet::new(),
+        called: HashMap::new(),
     };
     check.find_owner(&volumes).await?;
     for volume in volumes {
@@ -238,6 +240,8 @@ struct Check<'a> {
     of_others: HashSet<String>,
     /// Pyramids that a repair had their own tiles name again.
     renamed: HashSet<String>,
+    /// Names of tiles that a repair gave them in exchange for another's.
+    called: HashMap<TileId, String>,
 }
 
 impl Check<'_> {
@@ -391,7 +395,12 @@ impl Check<'_> {
         if self.history.was_deleted(tile.id, tile.revision) {
             return self.end_again(entry, &tile.name, &tile.pyramid).await;
         }
-        if self.unrecorded(entry, tile).await? {
+        let renamed = { self.called.get(&tile.id) }.map(|name| Tile {
+            name: name.clone(),
+            ..tile.clone()
+        });
+        let tile = renamed.as_ref().unwrap_or(tile);
+        if self.called_otherwise(entry, tile).await? {
             return Ok(());
         }
         let settled = self.settle(entry, tile).await?;

@@ -44,6 +44,17 @@ pub struct Naming {
     pub has_volume: bool,
 }
 
+/// The row that has a tile's name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Holder {
+    /// The tile whose row it is.
+    pub tile: TileId,
+    /// Position of the record that brought its image, or of its end; `None` where that cannot be.
+    pub position: Option<u64>,
+    /// Whether it is called deleted.
+    pub deleted: bool,
+}
+
 /// Asks for [`Placing`]s of a volume's rows.
 macro_rules! placings {
     ($which:literal) => {
@@ -117,17 +128,23 @@ impl Catalog {
         Ok(self.ask(question, &values, rows::origin).await?.pop())
     }
 
-    /// Whether a row has a tile's name, be the tile there or deleted.
+    /// The row that has a tile's name, be the tile there or deleted.
     ///
     /// # Errors
     ///
     /// [`CatalogError::UnknownVolume`], or what the database says.
-    pub async fn has_row(&self, volume: &str, tile: &str) -> Result<bool, CatalogError> {
+    pub async fn holder(&self, volume: &str, tile: &str) -> Result<Option<Holder>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let question = "SELECT id FROM tiles WHERE volume = $1 AND name = $2";
+        let question = "SELECT id, position, deleted FROM tiles WHERE volume = $1 AND name = $2";
+        let holder = |row: &Row| {
+            Ok(Holder {
+                tile: TileId(row.get("id")?),
+                position: rows::unsigned(row, "position").ok(),
+                deleted: row.get::<i64>("deleted")? != 0,
+            })
+        };
         let values = [id.into(), tile.into()];
-        let found = self.ask(question, &values, |row| row.get::<i64>("id"));
-        Ok(!found.await?.is_empty())
+        Ok(self.ask(question, &values, holder).await?.pop())
     }
 
     /// What brought the tiles of a section to where they lie; those of which it cannot be understood are left out.

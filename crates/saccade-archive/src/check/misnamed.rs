@@ -1,99 +1,15 @@
-//! Rows whose tiles have another's name, or name another's pyramid.
+//! Rows that name another tile's pyramid.
 
 use std::hash::BuildHasher as _;
 
 use super::names::Name;
 use super::repair::Source;
 use super::{Check, CheckError, FindingKind, Repair};
-use crate::acquisition::Record;
 use crate::catalog::{Origin, Tile, VolumeEntry};
 use crate::pyramid::{PyramidError, Verified};
 use crate::storage::StorageError;
 
 impl Check<'_> {
-    /// A tile of whose name the records at hand have none; whether it is so.
-    pub(super) async fn unrecorded(
-        &mut self,
-        entry: &VolumeEntry,
-        tile: &Tile,
-    ) -> Result<bool, CheckError> {
-        let known = self
-            .records
-            .as_ref()
-            .map(|records| records.know(&tile.name));
-        let (Some(false), Some(read)) = (known, self.read) else {
-            return Ok(false);
-        };
-        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let row = catalog.origin(volume, tile.id).await?;
-        // Another may have read on meanwhile.
-        let Some(row) = row.filter(|row| row.position < read.offset) else {
-            return Ok(false);
-        };
-        let name = Name::of(&tile.pyramid);
-        let of = match self.record_at(entry, row.position) {
-            Some((_, Record::Tile(record))) => Some(record.tile),
-            _ => None,
-        };
-        let is_of = |of: &String| {
-            name.is_some_and(|name| {
-                name.volume == *volume && name.position == row.position && name.is_after(of)
-            })
-        };
-        let of = of.filter(is_of);
-        // Of another that names it as well, it is that one's.
-        match &of {
-            Some(_) => _ = self.kept.insert((volume.clone(), row.position)),
-            None => _ = self.named.insert(self.hasher.hash_one(&tile.pyramid)),
-        }
-        let mut reason = "no record of the acquisition is of a tile of this name".to_owned();
-        let mut repair = None;
-        match of {
-            Some(of) if !catalog.has_row(volume, &of).await? => {
-                if let Some(records) = &mut self.records {
-                    records.meet(&of);
-                }
-                reason.push_str(&format!(
-                    ", and its pyramid is that of tile {of}, which the catalog lacks"
-                ));
-                if self.options.repair {
-                    let mut commit = catalog.begin(volume).await?;
-                    commit.rename(tile, &of).await?;
-                    commit.finish().await?;
-                    repair = Some(Repair::Renamed);
-                } else {
-                    reason.push_str(": `saccade check --repair` calls it so again");
-                }
-            }
-            Some(of) => {
-                reason.push_str(&format!(
-                    ", and its pyramid is that of tile {of}, which is there as well"
-                ));
-                if self.options.repair {
-                    let mut commit = catalog.begin(volume).await?;
-                    commit.take_away(&tile.name).await?;
-                    commit.finish().await?;
-                    repair = Some(Repair::TakenAway);
-                } else {
-                    reason.push_str(": `saccade check --repair` takes it away");
-                }
-            }
-            None => {
-                if let Some(name) = name.filter(|name| name.volume != *volume) {
-                    reason.push_str(&format!(
-                        ", and its pyramid is one of volume {:?}: with --acquisition FOLDER of that one, --repair has ingest make \
-                         what is lost there anew",
-                        name.volume
-                    ));
-                }
-                reason.push_str("; a delete of it in `saccade update` takes it away");
-            }
-        }
-        self.find(FindingKind::Spoilt, entry, Some(tile), reason)
-            .repair = repair;
-        Ok(true)
-    }
-
     /// A tile that names the pyramid of another tile, of another volume, or of an older image of its own; whether it does.
     pub(super) async fn misnamed(
         &mut self,

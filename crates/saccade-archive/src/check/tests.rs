@@ -12,6 +12,7 @@ use crate::image::GrayImage;
 use crate::pyramid::{Encoding, encode};
 
 mod audit;
+mod called;
 mod meddled;
 mod rows;
 mod unsound;

@@ -4,7 +4,7 @@ use saccade_core::transform::SectionFromTile;
 
 use super::Commit;
 use crate::catalog::database::Value;
-use crate::catalog::{CatalogError, ChangeReason, Tile, place};
+use crate::catalog::{CatalogError, ChangeReason, Tile, TileId, place};
 
 impl Commit<'_> {
     /// Has a tile name another pyramid, if it is still as it was found. The one that it named is not retired: it is another's.
@@ -27,23 +27,35 @@ impl Commit<'_> {
         self.forget_retired(to).await
     }
 
-    /// Gives a tile another name, if it is still as it was found and no row has that name.
+    /// Gives a tile another name, if it is still as it was found; a row that has that name gets the tile's.
     ///
     /// # Errors
     ///
     /// What the database says.
     pub async fn rename(&mut self, tile: &Tile, to: &str) -> Result<(), CatalogError> {
+        let now = self.existing(&tile.name).await?;
+        if now.is_none_or(|now| now.id != tile.id || now.deleted) {
+            return Ok(());
+        }
+        let holder = self.existing(to).await?.filter(|row| row.id != tile.id);
+        if let Some(row) = &holder {
+            // No two rows have one name, also not in between.
+            let between = format!("{to} {}", row.id.0);
+            self.call(row.id, &between).await?;
+        }
         self.log_again(tile).await?;
-        let update = "UPDATE tiles SET name = $4, revision = $5 \
-                      WHERE id = $1 AND volume = $2 AND name = $3 AND deleted = 0 \
-                      AND NOT EXISTS (SELECT 1 FROM tiles t WHERE t.volume = $2 AND t.name = $4)";
-        let values = [
-            tile.id.0.into(),
-            self.volume.into(),
-            (&tile.name).into(),
-            to.into(),
-            self.revision.into(),
-        ];
+        self.call(tile.id, to).await?;
+        if let Some(row) = holder {
+            self.log_change(row.id, row.place, row.place, ChangeReason::Tile)
+                .await?;
+            self.call(row.id, &tile.name).await?;
+        }
+        Ok(())
+    }
+
+    async fn call(&mut self, tile: TileId, name: &str) -> Result<(), CatalogError> {
+        let update = "UPDATE tiles SET name = $2, revision = $3 WHERE id = $1";
+        let values = [tile.0.into(), name.into(), self.revision.into()];
         self.run(update, &values).await?;
         Ok(())
     }

@@ -30,7 +30,7 @@ impl Fixture {
     }
 
     /// Deletes a tile as `saccade update` does.
-    async fn delete(&self, tile: &str) {
+    pub(super) async fn delete(&self, tile: &str) {
         let position = self.cursor().await.offset - 1;
         let deleted = self.archive.catalog().delete_tile(VOLUME, tile, position);
         deleted.await.unwrap();
@@ -444,55 +444,6 @@ async fn tiles_that_lie_within_what_changed_and_did_not_come_there_are_moved_bac
         assert_eq!(fixture.transform(tile).await, at(90.0));
     }
     assert_eq!(fixture.look(false).await.findings, []);
-}
-
-#[tokio::test]
-async fn tiles_of_names_that_no_record_has_get_their_own_again_or_are_taken_away() {
-    let fixture = Fixture::new().await;
-    let catalog = fixture.archive.catalog();
-    catalog.set_transform(VOLUME, "t2", at(44.0)).await.unwrap();
-    let bogus = "UPDATE tiles SET name = 'bogus' WHERE name = 't2'";
-    fixture.meddle(&[bogus]).await;
-    let report = fixture.look(false).await;
-    assert_eq!(found(&report), [(FindingKind::Spoilt, "bogus")]);
-    let reason = &report.findings[0].reason;
-    assert!(
-        reason.contains("tile t2") && reason.contains("--repair"),
-        "{reason}"
-    );
-    let named = [(FindingKind::Spoilt, Some(Repair::Renamed))];
-    assert_eq!(repairs(&fixture.look(true).await), named);
-    assert_eq!(fixture.transform("t2").await, at(44.0));
-    assert!(fixture.path(2).is_file());
-
-    // One beside it is none.
-    let columns = "volume, section, width, height, a, b, c, d, tx, ty, pyramid, revision, position, transform_position";
-    let beside = format!(
-        "INSERT INTO tiles (name, {columns}) SELECT 'bogus', {columns} FROM tiles WHERE name = 't2'"
-    );
-    fixture
-        .meddle(&[&beside, "UPDATE volumes SET tiles = tiles + 1"])
-        .await;
-    let report = fixture.look(true).await;
-    let away = [(FindingKind::Spoilt, Some(Repair::TakenAway))];
-    assert_eq!(repairs(&report), away);
-    assert!(fixture.path(2).is_file());
-    assert!(catalog.tile(VOLUME, "bogus").await.unwrap().is_none());
-    assert_eq!(fixture.look(false).await.findings, []);
-
-    // Of one that has nothing of anybody's it is told what helps.
-    let nobodys = "UPDATE tiles SET name = 'nobodys', pyramid = 'tiles/v/000001/bogus-7.tif' WHERE name = 't2'";
-    fixture.meddle(&[nobodys]).await;
-    let report = fixture.look(true).await;
-    let told = report
-        .findings
-        .iter()
-        .find(|f| f.tile.as_deref() == Some("nobodys"))
-        .unwrap();
-    assert_eq!((told.kind, told.repair), (FindingKind::Spoilt, None));
-    assert!(told.reason.contains("`saccade update`"), "{}", told.reason);
-    assert!(!told.reason.contains("append"), "{}", told.reason);
-    assert!(fixture.path(2).is_file());
 }
 
 #[tokio::test]
