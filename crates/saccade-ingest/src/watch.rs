@@ -11,7 +11,8 @@
 //! Folders of sections are cursors: one look asks at most [`WatchConfig::budget`] folders and files what
 //! they are, lists only folders that changed since they were last listed, and goes on where the last look
 //! stopped. Sixteen bytes are kept per file, and as many more for those that an earlier process told of, until
-//! they are met; and in a file, `stamps`, as many for each time that one was told of. A file counts as new when its
+//! they are met; twice as many for those in folders whose names say the same, as all do where the pattern has `{}` for them;
+//! and in a file, `stamps`, as many for each time that one was told of. A file counts as new when its
 //! folder changed and its length or time did, or it is another file, so a microscope that images a tile again
 //! writes it under a temporary name and renames it, or under another name. For half a minute after it was found or
 //! changed, a file itself is looked at, each second, with half of the budget at most: one that was filled meanwhile
@@ -401,14 +402,15 @@ impl<F: Folders> Watch<F> {
         ))
     }
 
-    /// Which files came since this was asked last that mean a tile which another file of their folder means as well.
+    /// Which files came since this was asked last that mean a tile which another file means as well, or one that was there.
     pub fn doubles(&mut self) -> Option<String> {
         let Doubles { such_as, files } = self.scanner.doubles();
         let Found { file, place } = such_as?;
         Some(format!(
-            "{files} files are named so that other files of their folder mean the same tiles, such as {file:?} of tile {}: of such \
-             files the one that was found last counts, and of those found at once the last by name. Let the pattern say what tells \
-             them apart; or take away what is not to be seen, and touch what is, for a file that is gone leaves its tile: {}",
+            "{files} files are named so that others of their folder, or of one whose name says the same, mean the same tiles, such as \
+             {file:?} of tile {}: of such files the one that was found last and can be read counts, and of those of a folder that were \
+             found at once the last by name. Let the pattern say what tells them apart; or take away what is not to be seen, and \
+             touch what is, for a file that is gone leaves its tile: {}",
             place.name(),
             self.folder.display()
         ))

@@ -282,12 +282,15 @@ pub(super) fn is_meant(path: &Path, images: &Images) -> bool {
 /// Whether a list that names no image that is there is one nevertheless, of images that were renamed or left
 /// behind.
 pub(super) fn is_certain(path: &Path, tiles: &[Listed]) -> bool {
-    let image = |tile: &Listed| {
-        let name = tile.file.to_lowercase();
-        let kinds = [".tif", ".tiff", ".png", ".jpg", ".jpeg"];
-        kinds.iter().any(|kind| name.ends_with(kind))
-    };
-    !tiles.is_empty() && (tiles.iter().all(image) || is_configuration(path))
+    let are_images = files(tiles).all(is_image_name);
+    !tiles.is_empty() && (are_images || is_configuration(path))
+}
+
+/// Whether a name ends as those of images do that can be read.
+pub(crate) fn is_image_name(name: &str) -> bool {
+    let name = name.to_lowercase();
+    let kinds = [".tif", ".tiff", ".png", ".jpg", ".jpeg"];
+    kinds.iter().any(|kind| name.ends_with(kind))
 }
 
 /// Whether a file is a project of TrakEM2 with images, readable or not.

@@ -282,7 +282,9 @@ impl<F: Folders> ListWatch<F> {
             let there = names(file).find_map(|name| odd.get(&*name).copied());
             let Some(path) = there.or_else(|| self.index.folder(file)) else {
                 if examples.len() < SHOWN {
+                    let is_listed = |name: &str| self.by_name.contains_key(&key(name));
                     let why = self.not_taken(file);
+                    let why = why.or_else(|| self.index.nearly(file, is_listed));
                     let why = why.map_or_else(String::new, |why| format!(" ({why})"));
                     examples.push(format!("{file:?}{why}"));
                 }

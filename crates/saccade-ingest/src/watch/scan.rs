@@ -161,13 +161,40 @@ struct Listing {
     places: HashSet<u64>,
 }
 
-/// Files that mean a place which another file of their folder means as well.
+/// Files that mean a place which another file means as well.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Doubles {
     /// One of them.
     pub(super) such_as: Option<Found>,
     /// How many.
     pub(super) files: usize,
+}
+
+/// Folders whose names say the same, so that their files may mean the same places.
+#[derive(Debug, Default)]
+struct Alike {
+    /// The first folder whose name says so, by the hash of that.
+    first: HashMap<u64, usize>,
+    /// In which folder a file of a place was met first, by the hash of the place: of those of which there are several.
+    files: HashMap<u64, HashMap<u64, usize>>,
+}
+
+impl Alike {
+    /// A folder whose name says something; the only one so far whose name says the same, if there is one.
+    fn comes(&mut self, folder: usize, said: u64) -> Option<usize> {
+        let first = *self.first.entry(said).or_insert(folder);
+        if first == folder || self.files.contains_key(&said) {
+            return None;
+        }
+        self.files.insert(said, HashMap::new());
+        Some(first)
+    }
+
+    /// Whether a file in another folder than this one, whose name says the same, means a place, or meant it.
+    fn is_elsewhere(&mut self, folder: usize, said: u64, place: u64) -> bool {
+        let files = self.files.get_mut(&said);
+        files.is_some_and(|files| *files.entry(place).or_insert(folder) != folder)
+    }
 }
 
 /// Goes round the folders, a bounded number of questions at a time.
@@ -203,9 +230,10 @@ pub struct Scanner<F> {
     lost: BTreeMap<PathBuf, Lost>,
     /// The last of them that was asked for.
     lost_at: PathBuf,
-    /// Files that mean a place which another file of their folder means, by the hashes of their paths, and those of them that
-    /// were not asked for yet.
+    /// Files that mean a place which another file means, by the hashes of their paths, and those of them that were not asked for
+    /// yet.
     doubles: (HashSet<u64>, Doubles),
+    alike: Alike,
     /// When the last of them was told of.
     told_until: SystemTime,
     hasher: BuildHasherDefault<DefaultHasher>,
@@ -243,6 +271,7 @@ impl<F: Folders> Scanner<F> {
             lost: BTreeMap::new(),
             lost_at: PathBuf::new(),
             doubles: (HashSet::new(), Doubles::default()),
+            alike: Alike::default(),
             told_until: SystemTime::UNIX_EPOCH,
             hasher: BuildHasherDefault::default(),
             counts: Counts::default(),
@@ -285,7 +314,7 @@ impl<F: Folders> Scanner<F> {
         (said.collect(), more)
     }
 
-    /// Files that were met since this was asked last, and mean what another one of their folder means: each once.
+    /// Files that were met since this was asked last, and mean what another one means, or one that was there: each once.
     pub(super) fn doubles(&mut self) -> Doubles {
         std::mem::take(&mut self.doubles.1)
     }
@@ -519,6 +548,13 @@ impl<F: Folders> Scanner<F> {
                 let depth = depth + 1;
                 let index = self.known.len();
                 self.paths.insert(below.clone(), index);
+                if depth == self.pattern.depth() {
+                    let first = self.alike.comes(index, self.hasher.hash_one(&place));
+                    // What is in it was not kept so far.
+                    if let Some(first) = first {
+                        self.known[first].listed = None;
+                    }
+                }
                 self.known.push(Known {
                     path: below,
                     depth,
@@ -541,7 +577,10 @@ impl<F: Folders> Scanner<F> {
             return;
         };
         self.counts.fit += 1;
-        if !listing.places.insert(self.hasher.hash_one(&place)) {
+        let said = self.hasher.hash_one(&self.known[folder].place);
+        let means = self.hasher.hash_one(&place);
+        let is_elsewhere = self.alike.is_elsewhere(folder, said, means);
+        if !listing.places.insert(means) || is_elsewhere {
             let file = below.to_string_lossy().into_owned();
             let (known, new) = &mut self.doubles;
             if known.len() < MOST_DOUBLES && known.insert(self.hasher.hash_one(&file)) {

@@ -1,6 +1,6 @@
 //! What is settled when a list is first read, and kept: which volume it is, and where in the list it lies.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ use saccade_core::volume::{Dtype, MAX_EXTENT};
 
 use super::super::{LINK, SETTINGS, WatchError, is_unused};
 use super::counted::Counted;
-use super::index::{Index, Sought};
+use super::index::{Index, Sought, base};
 use super::source::{Adopted, Listing, adopt, line_of, raw};
 use super::{ListConfig, ListError, MOST_ASKED};
 use crate::replay::ReplayError;
@@ -232,7 +232,12 @@ pub(super) fn begin(
             Some(format!("{:?} ({why})", tile.file))
         });
         let first = tiles.first().map_or("", |tile| &tile.file);
-        let such_as = told.next().unwrap_or_else(|| format!("{first:?}"));
+        let listed: HashSet<&str> = tiles.iter().map(|tile| base(&tile.file)).collect();
+        let nearly = || {
+            let why = index.nearly(first, |name| listed.contains(name));
+            why.map_or_else(|| format!("{first:?}"), |why| format!("{first:?} ({why})"))
+        };
+        let such_as = told.next().unwrap_or_else(nearly);
         let (unknown, options) = match (spans, config.dtype) {
             (true, None) => ("size and bits", "--extent, --origin and --bits"),
             (true, Some(_)) => ("size and place", "--extent and --origin"),

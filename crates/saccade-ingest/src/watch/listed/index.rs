@@ -14,10 +14,11 @@ use saccade_archive::acquisition::image_path;
 use saccade_archive::acquisition::listed_images::{Ends, Files, Mentions, NotTaken, Seeker};
 pub(super) use saccade_archive::acquisition::listed_images::{Sought, key, names};
 pub(super) use saccade_archive::acquisition::tile_list::base;
-use saccade_archive::acquisition::tile_list::decoded;
+use saccade_archive::acquisition::tile_list::{decoded, stem};
 
 use super::super::{Entry, Folders, Next, Pattern, no_folder};
 use super::channels::channel_of;
+use crate::replay::lists::is_image_name;
 
 /// A folder's time counts only once it is this old: file systems stamp coarsely.
 const SETTLED: Duration = Duration::from_secs(3);
@@ -233,6 +234,36 @@ impl Index {
             NotTaken::Channel => format!("{path:?} is of another channel, as paths say"),
         };
         Some((path, why))
+    }
+
+    /// Of what is missing: an image that is called so but for its end or the case of letters, in words. Few folders are looked
+    /// through for it.
+    pub(super) fn nearly(&self, file: &str, is_listed: impl Fn(&str) -> bool) -> Option<String> {
+        /// Entries that are looked at, at most.
+        const MOST_LOOKED_AT: usize = 4096;
+        let plain = |name: &str| stem(name).to_lowercase();
+        let wanted: Vec<_> = names(file).map(|name| plain(&name)).collect();
+        let entries = { self.folders.iter() }
+            .filter_map(|folder| fs::read_dir(self.root.join(&folder.path)).ok())
+            .flatten();
+        let mut names = { entries.take(MOST_LOOKED_AT) }.filter_map(|entry| {
+            entry
+                .ok()?
+                .path()
+                .strip_prefix(&self.root)
+                .ok()
+                .map(Path::to_owned)
+        });
+        let near = names.find(|path| {
+            let name = path
+                .file_name()
+                .and_then(|name| name.to_str())
+                .unwrap_or_default();
+            is_image_name(name) && !is_listed(name) && wanted.contains(&plain(name))
+        })?;
+        Some(format!(
+            "{near:?} is called so but for its end or the case of letters; name it in the list as it is called"
+        ))
     }
 
     /// Looks again at some of what is nothing to read: links may lead to something later.

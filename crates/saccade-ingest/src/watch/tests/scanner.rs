@@ -439,3 +439,44 @@ fn files_of_one_folder_that_mean_one_place_are_told_once() {
     disk.add("s2", "r7_c.tif", false, 3);
     assert_eq!(look(), (None, 0));
 }
+
+/// What of a folder's name does not matter, or how its number is written, tells no places apart.
+#[test]
+fn files_of_folders_that_say_the_same_and_mean_one_place_are_told_once() {
+    for (pattern, folders) in [
+        ("s{section}/r{row}.tif", ["s1", "s01", "s2"]),
+        ("s{section}_{}/r{row}.tif", ["s1_a", "s1_b", "s2_a"]),
+    ] {
+        let [one, other, apart] = folders;
+        let disk = Counted::default();
+        disk.add("", one, true, 1);
+        disk.add(one, "r1.tif", false, 1);
+        disk.add(one, "r3.tif", false, 1);
+        disk.add("", apart, true, 1);
+        disk.add(apart, "r1.tif", false, 1);
+        let pattern: Pattern = pattern.parse().unwrap();
+        let mut scanner = Scanner::new(disk.clone(), Path::new("/r"), pattern);
+        let mut look = || {
+            let (found, _) = scanner.look(99).unwrap();
+            scanner.look(99).unwrap();
+            let Doubles { such_as, files } = scanner.doubles();
+            let such_as = such_as.map(|found| found.place);
+            (
+                found.len(),
+                such_as.map(|place| (place.section, place.row)),
+                files,
+            )
+        };
+        assert_eq!(look(), (3, None, 0));
+        // The second of them comes later than what is in the first.
+        disk.add("", other, true, 2);
+        disk.add(other, "r1.tif", false, 2);
+        disk.add(other, "r2.tif", false, 2);
+        assert_eq!(look(), (2, Some((1, 1)), 1), "{folders:?}");
+        assert_eq!(look(), (0, None, 0));
+        disk.add(one, "r2.tif", false, 3);
+        assert_eq!(look(), (1, Some((1, 2)), 1));
+        disk.add(apart, "r2.tif", false, 3);
+        assert_eq!(look(), (1, None, 0));
+    }
+}
