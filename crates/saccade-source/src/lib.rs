@@ -32,6 +32,7 @@ mod flights;
 #[cfg(all(any(test, fuzzing), not(target_family = "wasm")))]
 pub mod fuzz_targets;
 pub mod images;
+mod limits;
 pub mod maybe_send;
 pub mod memory;
 pub mod objects;

@@ -20,6 +20,7 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 
 use crate::flights::{Flights, Weighed, Work};
+use crate::limits::CACHE_BYTES;
 use crate::maybe_send::{BoxFuture, BoxStream, MaybeSend, MaybeSync};
 use crate::objects::ObjectError;
 use crate::values::Values;
@@ -31,13 +32,6 @@ pub(crate) use placed::Placed;
 pub(crate) use replaced::{Indexed, Indices, Replaced};
 pub(crate) use sample::{Sample, sampled};
 use watch::Watch;
-
-/// Decoded chunks that are kept, all levels together \[bytes\]. A page has 4 GB at most, and shares it with what it shows.
-const CACHE_BYTES: u64 = if cfg!(target_family = "wasm") {
-    128 << 20
-} else {
-    512 << 20
-};
 
 /// One of the image's own chunks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]

@@ -1,5 +1,12 @@
 //! What the application opens with.
 
+#[cfg(not(target_family = "wasm"))]
+#[path = "options/native.rs"]
+mod platform;
+#[cfg(target_family = "wasm")]
+#[path = "options/wasm.rs"]
+mod platform;
+
 use std::sync::Arc;
 
 use glam::{DVec3, UVec2};
@@ -388,12 +395,9 @@ pub fn gpu_memory_from_text(text: &str) -> Result<u64, ShownError> {
 ///
 /// [`ShownError`] on anything else, less than anything can be shown with, and, in a browser, more than pages have.
 pub fn host_memory_from_text(text: &str) -> Result<u64, ShownError> {
-    let (most, wanted) = if cfg!(target_family = "wasm") {
-        (2048, "whole MiB from 16 to 2048, as in 512")
-    } else {
-        (u32::MAX, "whole MiB from 16 on, as in 512")
-    };
-    memory_from_text(text, 16, most, "ceiling for main memory", wanted)
+    use platform::{HOST_MEMORY_WANTED, MOST_HOST_MIB};
+    let what = "ceiling for main memory";
+    memory_from_text(text, 16, MOST_HOST_MIB, what, HOST_MEMORY_WANTED)
 }
 
 fn memory_from_text(

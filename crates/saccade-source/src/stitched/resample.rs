@@ -6,6 +6,9 @@ mod line;
 mod sample;
 #[cfg(target_arch = "x86_64")]
 mod wide;
+#[cfg(not(target_arch = "x86_64"))]
+#[path = "resample/narrow.rs"]
+mod wide;
 
 use bytes::Bytes;
 use glam::{DVec2, UVec2};

@@ -12,15 +12,9 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::{Piece, PieceError, PieceId, Pieces};
 use crate::changes::Changes;
+use crate::limits::KNOWN_PIECES;
 use crate::maybe_send::BoxStream;
 use crate::{Change, ChangeReason};
-
-/// Pieces that are known again.
-const KNOWN: usize = if cfg!(target_family = "wasm") {
-    1 << 14
-} else {
-    1 << 18
-};
 
 /// What pieces held when they were read last.
 #[derive(Clone)]
@@ -33,7 +27,7 @@ impl Watch {
     /// For a volume of these level-0 voxels.
     pub(super) fn new(whole: VoxelBox) -> Self {
         Self {
-            known: Arc::new(Cache::new(KNOWN)),
+            known: Arc::new(Cache::new(KNOWN_PIECES)),
             changes: Changes::new(whole, 0),
         }
     }

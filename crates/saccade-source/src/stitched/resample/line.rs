@@ -192,7 +192,6 @@ pub(super) fn interpolate<K: OfSum>(
         line.step(skip);
         return shifted(values, width, line, out);
     }
-    #[cfg(target_arch = "x86_64")]
     if super::wide::serves(values, line) {
         let lead = skip % LANES;
         line.step(skip - lead);
