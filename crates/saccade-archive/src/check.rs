@@ -164,6 +164,7 @@ pub async fn check(
         objects: &objects,
         by_record: None,
         history: History::default(),
+        is_history_sure: false,
         of_others: HashSet::new(),
         renamed: HashSet::new(),
         called: HashMap::new(),
@@ -216,8 +217,8 @@ struct Check<'a> {
     compared: HashSet<String>,
     /// Volumes and positions of records of tiles whose rows do not name the pyramid that may be theirs.
     kept: HashSet<(String, u64)>,
-    /// Volumes whose tiles are counted wrongly, and the findings that say so.
-    miscounted: Vec<(String, usize)>,
+    /// Volumes whose tiles are counted wrongly, the findings that say so, and the sections that were left out.
+    miscounted: Vec<(String, usize, Vec<u32>)>,
     /// Those of them that have fewer than are counted, with nothing that says which.
     lacking: HashSet<String>,
     /// Those of them with objects that may be of tiles that were lost.
@@ -236,6 +237,8 @@ struct Check<'a> {
     by_record: Option<HashMap<u64, Vec<usize>>>,
     /// What the changes tell of the tiles of the volume at hand.
     history: History,
+    /// Whether it was read once more, since something was missed in it.
+    is_history_sure: bool,
     /// Volumes that the acquisition at hand is not of.
     of_others: HashSet<String>,
     /// Pyramids that a repair had their own tiles name again.
@@ -250,6 +253,7 @@ impl Check<'_> {
         let volume = &entry.volume;
         let before = self.report.tiles;
         self.history = catalog.history(&volume.name).await?;
+        self.is_history_sure = false;
         self.read_up_to(entry).await?;
         self.read_records(entry).await;
         self.described(entry);
@@ -294,8 +298,9 @@ impl Check<'_> {
             |z: &&u32| still.binary_search(z).is_ok() && counted.binary_search(z).is_err();
         // Those that the volume does not have are told with their tiles.
         let depth = entry.volume.extent().z;
-        let lacks = sections.iter().filter(|z| **z < depth);
-        let lacks = lacks.filter(is_lacking).count();
+        let lacking = sections.iter().filter(|z| **z < depth);
+        let lacking: Vec<u32> = lacking.filter(is_lacking).copied().collect();
+        let lacks = lacking.len();
         let all = (entry.tiles.min(now.tiles)..=entry.tiles.max(now.tiles)).contains(&tiles);
         if !all || lacks > 0 {
             let mut reason = format!(
@@ -309,7 +314,7 @@ impl Check<'_> {
             }
             let number = self.report.findings.len();
             self.find(FindingKind::Miscounted, entry, None, reason);
-            self.miscounted.push((volume.name.clone(), number));
+            self.miscounted.push((volume.name.clone(), number, lacking));
         }
         let later = catalog.clock().now() + Duration::from_secs(1 << 32);
         for retired in catalog.retired(&volume.name, later, u32::MAX).await? {
@@ -350,11 +355,19 @@ impl Check<'_> {
 
     /// Counts anew what is counted wrongly, where that is no sign of something that is lost.
     async fn recount(&mut self) -> Result<(), CheckError> {
-        for (volume, number) in std::mem::take(&mut self.miscounted) {
-            if self.options.repair && !self.doubtful.contains(&volume) {
-                self.archive.catalog().recount(&volume).await?;
-                self.report.findings[number].repair = Some(Repair::Recounted);
+        let catalog = self.archive.catalog();
+        for (volume, number, lacking) in std::mem::take(&mut self.miscounted) {
+            if !self.options.repair || self.doubtful.contains(&volume) {
+                continue;
             }
+            catalog.recount(&volume).await?;
+            // Who follows the volume took these for sections without tiles.
+            let mut commit = catalog.begin(&volume).await?;
+            for z in lacking {
+                commit.show_again(z).await?;
+            }
+            commit.finish().await?;
+            self.report.findings[number].repair = Some(Repair::Recounted);
         }
         Ok(())
     }
@@ -395,16 +408,13 @@ impl Check<'_> {
         if self.history.was_deleted(tile.id, tile.revision) {
             return self.end_again(entry, &tile.name, &tile.pyramid).await;
         }
-        let renamed = { self.called.get(&tile.id) }.map(|name| Tile {
-            name: name.clone(),
-            ..tile.clone()
-        });
-        let tile = renamed.as_ref().unwrap_or(tile);
-        if self.called_otherwise(entry, tile).await? {
+        let Some(tile) = self.rightly_called(entry, tile).await? else {
             return Ok(());
-        }
+        };
+        let tile = &*tile;
         let settled = self.settle(entry, tile).await?;
         let tile = settled.as_ref().unwrap_or(tile);
+        self.misnumbered(entry, tile).await?;
         if let Some(reason) = self.contradicted(entry, tile) {
             self.named.insert(self.hasher.hash_one(&tile.pyramid));
             return self.mend(FindingKind::Spoilt, entry, tile, reason).await;

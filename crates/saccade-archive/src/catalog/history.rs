@@ -37,6 +37,12 @@ impl History {
         self.oldest.is_some_and(|oldest| oldest <= 1)
     }
 
+    /// Whether changes of a revision are kept: all are from the oldest one on, and the newest always.
+    pub fn is_kept(&self, revision: u64) -> bool {
+        let oldest = self.oldest.unwrap_or(0);
+        revision > 0 && i64::try_from(revision).is_ok_and(|revision| oldest <= revision)
+    }
+
     /// Whether a tile's last change is its deletion, of one that is said to have changed `at` a revision: nothing that could
     /// have brought it back since is missed.
     pub fn was_deleted(&self, tile: TileId, at: u64) -> bool {

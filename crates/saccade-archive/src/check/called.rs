@@ -1,135 +1,176 @@
 //! Rows that have another tile's name, or that of none.
 
+use std::borrow::Cow;
 use std::hash::BuildHasher as _;
 
 use super::names::Name;
+use super::repair::position_of;
 use super::{Check, CheckError, FindingKind, Repair};
 use crate::acquisition::Record;
 use crate::catalog::{Holder, Tile, VolumeEntry};
 
 impl Check<'_> {
-    /// A tile that is not called as its record is, by its row as well as by its pyramid, or as none of the records at hand; whether it
-    /// is so.
-    pub(super) async fn called_otherwise(
+    /// A tile as its record and its pyramid call it, where its row has another tile's name or that of none; that is told. `None` where it
+    /// is none of the records' tiles, or is there once more.
+    pub(super) async fn rightly_called<'t>(
         &mut self,
         entry: &VolumeEntry,
-        tile: &Tile,
-    ) -> Result<bool, CheckError> {
+        listed: &'t Tile,
+    ) -> Result<Option<Cow<'t, Tile>>, CheckError> {
         let Some((records, read)) = self.records.as_ref().zip(self.read) else {
-            return Ok(false);
+            return Ok(Some(Cow::Borrowed(listed)));
+        };
+        let tile = match self.called.get(&listed.id) {
+            Some(name) => Cow::Owned(Tile {
+                name: name.clone(),
+                ..listed.clone()
+            }),
+            None => Cow::Borrowed(listed),
         };
         let is_known = records.know(&tile.name);
         if is_known && records.newest_of(&tile.name) == Some(tile.position) {
-            return self.got_its_name(entry, tile);
+            return Ok(Some(self.got_its_name(entry, listed, tile)));
         }
         let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
         let row = catalog.origin(volume, tile.id).await?;
         // Another may have read on meanwhile.
         let Some(row) = row.filter(|row| row.position < read.offset) else {
-            return Ok(false);
+            return Ok(Some(tile));
         };
-        let of = self.recorded(entry, row.position).filter(|of| {
-            Name::of(&tile.pyramid).is_some_and(|name| {
-                name.volume == *volume && name.position == row.position && name.is_after(of)
-            })
-        });
-        match of {
-            Some(of) if is_known && of == tile.name => self.got_its_name(entry, tile),
-            Some(of) => self.called_as_another(entry, tile, &of, is_known).await,
-            None if is_known => Ok(false),
-            None => self.called_as_none(entry, tile),
+        let by_row = self.recorded(entry, row.position);
+        let by_pyramid = Name::of(&tile.pyramid)
+            .filter(|name| name.volume == *volume && name.position < read.offset)
+            .and_then(|name| {
+                let of = self.recorded(entry, name.position)?;
+                name.is_after(&of).then_some(of)
+            });
+        match by_pyramid {
+            Some(of) if of == tile.name => Ok(Some(self.got_its_name(entry, listed, tile))),
+            // It names another's pyramid.
+            Some(_) if by_row.as_ref() == Some(&tile.name) => Ok(Some(tile)),
+            Some(of) => {
+                let is_sure = by_row.as_ref() == Some(&of);
+                let holder = catalog.holder(volume, &of).await?;
+                let is_there =
+                    holder.is_some_and(|row| self.is_right(entry, row, &tile, &of, is_known));
+                match (is_known, is_there) {
+                    (true, true) => return Ok(Some(tile)),
+                    (true, false) if !is_sure && holder.is_none() => return Ok(Some(tile)),
+                    (false, true) => self.is_there_as_well(entry, listed, &tile, &of).await?,
+                    (_, false) => {
+                        let named = self.call(entry, listed, &tile, &of, holder).await?;
+                        return Ok(Some(Cow::Owned(named)));
+                    }
+                }
+                Ok(None)
+            }
+            None if is_known => Ok(Some(tile)),
+            None => {
+                self.called_as_none(entry, listed);
+                Ok(None)
+            }
         }
     }
 
-    /// A tile that is called as it should be, now; whether that is only so since another got its own name again.
-    fn got_its_name(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<bool, CheckError> {
-        if !self.called.contains_key(&tile.id) {
-            return Ok(false);
-        }
-        if let Some(records) = &mut self.records {
-            records.meet(&tile.name);
-        }
-        let known = (entry.volume.name.clone(), tile.position);
-        self.kept.insert(known);
-        let reason = "its row had another tile's name".to_owned();
-        self.find(FindingKind::Spoilt, entry, Some(tile), reason)
-            .repair = Some(Repair::Renamed);
-        Ok(true)
-    }
-
-    /// A tile that is called otherwise than `of`, as its record and its pyramid have it; whether that is its row's fault.
-    async fn called_as_another(
-        &mut self,
+    /// Whether the row that has the name `of` is that tile's, where another has its pyramid.
+    fn is_right(
+        &self,
         entry: &VolumeEntry,
-        tile: &Tile,
+        row: Holder,
+        other: &Tile,
         of: &str,
         is_known: bool,
-    ) -> Result<bool, CheckError> {
-        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let holder = catalog.holder(volume, of).await?;
-        let is_right = |row: Holder| match row.deleted {
-            true => !is_known || self.records.as_ref().is_some_and(|r| r.is_deleted(of)),
-            false => { row.position }
-                .is_some_and(|at| self.recorded(entry, at).is_some_and(|its| its == of)),
-        };
-        let is_there = holder.is_some_and(is_right);
-        // Then it names that one's pyramid.
-        if is_known && is_there {
-            return Ok(false);
+    ) -> bool {
+        let record = { row.position }.and_then(|at| Some(self.record_at(entry, at)?.1));
+        match (row.deleted, record) {
+            (false, Some(Record::Tile(record))) => record.tile == of,
+            (false, _) => false,
+            (true, Some(Record::Delete(record))) => record.tile == of,
+            (true, _) if is_known => self.records.as_ref().is_some_and(|r| r.is_deleted(of)),
+            // Somebody has deleted it, or the row of another that was deleted has its name: of what never was, nothing changed.
+            (true, _) => self.history.is_whole() && self.history.last(other.id).is_none(),
         }
-        // Of another that names it as well, it is that one's.
-        let known = (volume.clone(), tile.position);
-        self.kept.insert(known);
-        let mut reason = match is_known {
-            true => "its record is of another tile".to_owned(),
-            false => "no record of the acquisition is of a tile of this name".to_owned(),
-        };
+    }
+
+    /// A tile that is called as it should be, now; that is told where it is only so since another got its own name again.
+    fn got_its_name<'t>(
+        &mut self,
+        entry: &VolumeEntry,
+        listed: &Tile,
+        tile: Cow<'t, Tile>,
+    ) -> Cow<'t, Tile> {
+        if self.called.contains_key(&tile.id) {
+            let reason = format!("what its row says is of tile {}", tile.name);
+            self.find(FindingKind::Spoilt, entry, Some(listed), reason)
+                .repair = Some(Repair::Renamed);
+        }
+        tile
+    }
+
+    /// Calls a tile as its pyramid has it, or tells that; the tile so.
+    async fn call(
+        &mut self,
+        entry: &VolumeEntry,
+        listed: &Tile,
+        tile: &Tile,
+        of: &str,
+        holder: Option<Holder>,
+    ) -> Result<Tile, CheckError> {
+        let mut reason = format!("what its row says is of tile {of}");
+        reason.push_str(match holder {
+            Some(_) => ", whose name another row has",
+            None => ", which the catalog lacks",
+        });
         let mut repair = None;
-        let mut commit = match self.options.repair {
-            true => Some(catalog.begin(volume).await?),
-            false => None,
-        };
-        if is_there {
-            reason.push_str(&format!(
-                ", and its pyramid is that of tile {of}, which is there as well"
-            ));
-            match &mut commit {
-                Some(commit) => {
-                    commit.take_away(&tile.name).await?;
-                    repair = Some(Repair::TakenAway);
-                }
-                None => reason.push_str(": `saccade check --repair` takes it away"),
-            }
-        } else {
-            if let Some(records) = &mut self.records {
-                records.meet(of);
-            }
-            reason.push_str(&format!(", and its pyramid is that of tile {of}"));
-            match holder {
-                Some(_) => reason.push_str(", whose name another row has"),
-                None => reason.push_str(", which the catalog lacks"),
-            }
-            match &mut commit {
-                Some(commit) => {
-                    commit.rename(tile, of).await?;
-                    repair = Some(Repair::Renamed);
-                    // It is looked at later, or was, and could not be understood.
-                    let other = holder.map(|row| (row.tile, tile.name.clone()));
-                    self.called.extend(other);
-                }
-                None => reason.push_str(": `saccade check --repair` calls it so again"),
-            }
-        }
-        if let Some(commit) = commit {
+        if self.options.repair {
+            let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+            commit.rename(tile, of).await?;
             commit.finish().await?;
+            repair = Some(Repair::Renamed);
+            // It is looked at later, or was, and could not be understood.
+            let other = holder.map(|row| (row.tile, tile.name.clone()));
+            self.called.extend(other);
+        } else {
+            reason.push_str(": `saccade check --repair` calls it so again");
         }
-        self.find(FindingKind::Spoilt, entry, Some(tile), reason)
+        self.find(FindingKind::Spoilt, entry, Some(listed), reason)
             .repair = repair;
-        Ok(true)
+        Ok(Tile {
+            name: of.to_owned(),
+            ..tile.clone()
+        })
+    }
+
+    /// A tile of whose name the records have none, with the pyramid of one that is there.
+    async fn is_there_as_well(
+        &mut self,
+        entry: &VolumeEntry,
+        listed: &Tile,
+        tile: &Tile,
+        of: &str,
+    ) -> Result<(), CheckError> {
+        // It is the other's.
+        let known = position_of(&tile.pyramid).map(|at| (entry.volume.name.clone(), at));
+        self.kept.extend(known);
+        let mut reason = format!(
+            "no record of the acquisition is of a tile of this name, and its pyramid is that of tile {of}, which is there as well"
+        );
+        let mut repair = None;
+        if self.options.repair {
+            let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+            commit.take_away(&tile.name).await?;
+            commit.finish().await?;
+            repair = Some(Repair::TakenAway);
+        } else {
+            reason.push_str(": `saccade check --repair` takes it away");
+        }
+        self.find(FindingKind::Spoilt, entry, Some(listed), reason)
+            .repair = repair;
+        Ok(())
     }
 
     /// A tile of whose name the records at hand have none, with a pyramid of which they do not tell whose it is.
-    fn called_as_none(&mut self, entry: &VolumeEntry, tile: &Tile) -> Result<bool, CheckError> {
+    fn called_as_none(&mut self, entry: &VolumeEntry, tile: &Tile) {
         self.named.insert(self.hasher.hash_one(&tile.pyramid));
         let mut reason = "no record of the acquisition is of a tile of this name".to_owned();
         let name = Name::of(&tile.pyramid);
@@ -142,6 +183,32 @@ impl Check<'_> {
         }
         reason.push_str("; a delete of it in `saccade update` takes it away");
         self.find(FindingKind::Spoilt, entry, Some(tile), reason);
+    }
+
+    /// A tile that is deleted, and called otherwise than the record that ended it has it; whether it is so.
+    pub(super) async fn ended_as_another(
+        &mut self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        position: u64,
+    ) -> Result<bool, CheckError> {
+        let records = self.records.as_ref();
+        if records.is_none_or(|records| records.position_of(&tile.name) == Some(position)) {
+            return Ok(false);
+        }
+        let of = match self.record_at(entry, position) {
+            Some((_, Record::Delete(record))) if record.tile != tile.name => record.tile,
+            _ => return Ok(false),
+        };
+        let holder = { self.archive.catalog() }.holder(&entry.volume.name, &of);
+        let holder = holder.await?;
+        // One that is there was entered again.
+        if holder.is_some_and(|row| {
+            !row.deleted || row.position.and_then(|at| self.ended(entry, at)).as_ref() == Some(&of)
+        }) {
+            return Ok(false);
+        }
+        self.call(entry, tile, tile, &of, holder).await?;
         Ok(true)
     }
 
@@ -151,5 +218,46 @@ impl Check<'_> {
             Record::Tile(record) => Some(record.tile),
             Record::Transform(_) | Record::Delete(_) => None,
         }
+    }
+
+    /// The tile that the record at a position ends.
+    fn ended(&self, entry: &VolumeEntry, at: u64) -> Option<String> {
+        match self.record_at(entry, at)?.1 {
+            Record::Delete(record) => Some(record.tile),
+            Record::Transform(_) | Record::Tile(_) => None,
+        }
+    }
+}
+
+impl Check<'_> {
+    /// A tile whose row says that its image is of another record than the pyramid has it, and its newest record is; of two that are
+    /// equally near, that decides which one is seen.
+    pub(super) async fn misnumbered(
+        &mut self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+    ) -> Result<(), CheckError> {
+        let newest = { self.records.as_ref() }.and_then(|records| records.newest_of(&tile.name));
+        let its = Name::of(&tile.pyramid).filter(|name| {
+            let is_its = name.volume == entry.volume.name && name.is_after(&tile.name);
+            is_its && Some(name.position) == newest && name.position != tile.position
+        });
+        let Some(Name { position, .. }) = its else {
+            return Ok(());
+        };
+        let reason = format!(
+            "the catalog says that its image is of the record at byte {}, and it is of the one at byte {position}",
+            tile.position
+        );
+        let mut repair = None;
+        if self.options.repair {
+            let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
+            commit.number(tile, position).await?;
+            commit.finish().await?;
+            repair = Some(Repair::Renumbered);
+        }
+        self.find(FindingKind::Spoilt, entry, Some(tile), reason)
+            .repair = repair;
+        Ok(())
     }
 }

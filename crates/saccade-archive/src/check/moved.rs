@@ -38,8 +38,13 @@ impl Check<'_> {
         let placing = { self.placings.as_ref() }
             .and_then(|(_, placings)| placings.get(&tile.id))
             .filter(|now| now.revision == tile.revision);
-        let its = placing.and_then(|now| self.its_place(entry, &shaped, said, now));
-        let Some((to, reason)) = its else {
+        let Some(placing) = placing.copied() else {
+            return Ok(None);
+        };
+        if placing.change.is_none() && self.lacks_change(entry, &placing).await? {
+            return self.untold(entry, tile, said).await;
+        }
+        let Some((to, reason)) = self.its_place(entry, &shaped, said, &placing) else {
             return Ok(None);
         };
         // One that ingest could not follow is told with what is set aside.
@@ -59,6 +64,50 @@ impl Check<'_> {
         self.find(FindingKind::Spoilt, entry, Some(tile), reason)
             .repair = settled.as_ref().map(|_| Repair::Moved);
         Ok(settled)
+    }
+
+    /// Whether the change is not there that brought a tile to its place, though as old ones are kept.
+    async fn lacks_change(
+        &mut self,
+        entry: &VolumeEntry,
+        placing: &Placing,
+    ) -> Result<bool, CheckError> {
+        if self.history.is_kept(placing.revision) && !self.is_history_sure {
+            // Old ones may have been forgotten since they were read.
+            self.history = self.archive.catalog().history(&entry.volume.name).await?;
+            self.is_history_sure = true;
+        }
+        Ok(self.history.is_kept(placing.revision))
+    }
+
+    /// A tile that lies elsewhere than its record says, where the change is lost that would tell whether somebody has moved it: it
+    /// stays.
+    async fn untold(
+        &mut self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+        said: Said,
+    ) -> Result<Option<Tile>, CheckError> {
+        let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
+        if catalog.is_set_aside(volume, &tile.name).await? {
+            return Ok(None);
+        }
+        let reason = format!(
+            "it lies at {:?}, its newest record (byte {}) says otherwise, and the catalog's changes lack the one that would tell \
+             whether somebody has moved it; say with `saccade update` where it lies, or `--repair` has it stay there",
+            tile.transform.elements(),
+            said.record
+        );
+        let mut repair = None;
+        if self.options.repair {
+            let mut commit = catalog.begin(volume).await?;
+            commit.confirm(tile).await?;
+            commit.finish().await?;
+            repair = Some(Repair::Confirmed);
+        }
+        self.find(FindingKind::Spoilt, entry, Some(tile), reason)
+            .repair = repair;
+        Ok(None)
     }
 
     /// A tile that is called deleted and is about to be brought back, where it belongs: as its row says, or, where nothing explains

@@ -171,6 +171,12 @@ impl Records {
         self.newest.contains_key(&self.hasher.hash_one(tile))
     }
 
+    /// The position of the newest record of a tile's image, or of its end.
+    pub(super) fn position_of(&self, tile: &str) -> Option<u64> {
+        let newest = self.newest.get(&self.hasher.hash_one(tile))?;
+        Some(newest.position)
+    }
+
     /// The position of the newest record of a tile's image, if it is not deleted since.
     pub(super) fn newest_of(&self, tile: &str) -> Option<u64> {
         let newest = self.newest.get(&self.hasher.hash_one(tile))?;

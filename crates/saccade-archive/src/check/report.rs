@@ -47,11 +47,13 @@ impl Finding {
                 Repair::Queued
                     | Repair::Recounted
                     | Repair::Moved
+                    | Repair::Confirmed
                     | Repair::Kept
                     | Repair::Reread
                     | Repair::Reindexed
                     | Repair::Restored
                     | Repair::Renamed
+                    | Repair::Renumbered
                     | Repair::TakenAway
             )
         )
@@ -98,12 +100,16 @@ pub enum Repair {
     Recounted,
     /// The tile lies where its records say.
     Moved,
+    /// The tile stays where it lies.
+    Confirmed,
     /// The pyramid is no longer to be deleted.
     Kept,
     /// The tile is no longer called deleted.
     Restored,
     /// The tile has its own name, or names its own pyramid, again.
     Renamed,
+    /// The tile is of the record of which its pyramid is.
+    Renumbered,
     /// The tile is none, or was deleted before, and is taken away.
     TakenAway,
     /// How far the records were read is found out from them: ingest goes on from there.

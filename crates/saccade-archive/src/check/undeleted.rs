@@ -12,7 +12,13 @@ impl Check<'_> {
         let mut after = i64::MIN;
         while let Some((last, rows)) = catalog.deleted_after(volume, after).await? {
             after = last;
-            for (tile, position) in rows {
+            for (mut tile, position) in rows {
+                if let Some(name) = self.called.get(&tile.id) {
+                    tile.name.clone_from(name);
+                }
+                if self.ended_as_another(entry, &tile, position).await? {
+                    continue;
+                }
                 let records = self.records.as_ref();
                 let is_recorded = records.is_some_and(|records| records.is_deleted(&tile.name));
                 if is_recorded || self.history.was_deleted(tile.id, 0) {

@@ -152,6 +152,8 @@ fn line(finding: &Finding) -> String {
         Some(Repair::Recounted) => "; counted anew",
         Some(Repair::Kept) => "; it is kept",
         Some(Repair::Restored) => "; it is brought back",
+        Some(Repair::Renumbered) => "; its record is mended, and nothing is lost",
+        Some(Repair::Confirmed) => "; it stays there",
         Some(Repair::Renamed) => "; its name is mended, and nothing is lost",
         Some(Repair::TakenAway) => "; taken away",
         Some(Repair::Reindexed) => "; its indexes are made anew, and it is sound",

@@ -1,6 +1,8 @@
 //! Rows that say what nothing explains, made to say what they did.
 
+use glam::UVec3;
 use saccade_core::transform::SectionFromTile;
+use saccade_core::voxel_box::VoxelBox;
 
 use super::Commit;
 use crate::catalog::database::Value;
@@ -27,37 +29,89 @@ impl Commit<'_> {
         self.forget_retired(to).await
     }
 
-    /// Gives a tile another name, if it is still as it was found; a row that has that name gets the tile's.
+    /// Gives a tile another name, if it is still called as it was found; a row that has that name gets the tile's. No voxel changes, and
+    /// nothing that tells what brought the two to where they lie.
     ///
     /// # Errors
     ///
     /// What the database says.
     pub async fn rename(&mut self, tile: &Tile, to: &str) -> Result<(), CatalogError> {
         let now = self.existing(&tile.name).await?;
-        if now.is_none_or(|now| now.id != tile.id || now.deleted) {
+        if now.is_none_or(|now| now.id != tile.id) {
             return Ok(());
         }
-        let holder = self.existing(to).await?.filter(|row| row.id != tile.id);
-        if let Some(row) = &holder {
-            // No two rows have one name, also not in between.
-            let between = format!("{to} {}", row.id.0);
-            self.call(row.id, &between).await?;
+        match self.existing(to).await? {
+            Some(holder) => {
+                // No two rows have one name, also not in between.
+                let between = format!("{to} {}", holder.id.0);
+                self.call(holder.id, &between).await?;
+                self.call(tile.id, to).await?;
+                self.call(holder.id, &tile.name).await
+            }
+            None => self.call(tile.id, to).await,
         }
-        self.log_again(tile).await?;
-        self.call(tile.id, to).await?;
-        if let Some(row) = holder {
-            self.log_change(row.id, row.place, row.place, ChangeReason::Tile)
-                .await?;
-            self.call(row.id, &tile.name).await?;
-        }
-        Ok(())
     }
 
     async fn call(&mut self, tile: TileId, name: &str) -> Result<(), CatalogError> {
-        let update = "UPDATE tiles SET name = $2, revision = $3 WHERE id = $1";
-        let values = [tile.0.into(), name.into(), self.revision.into()];
+        let update = "UPDATE tiles SET name = $2 WHERE id = $1";
+        self.run(update, &[tile.0.into(), name.into()]).await?;
+        Ok(())
+    }
+
+    /// Has a tile be of another record, if it names still the pyramid that it was found with.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn number(&mut self, tile: &Tile, position: u64) -> Result<(), CatalogError> {
+        self.log_again(tile).await?;
+        let update = "UPDATE tiles SET position = $4, revision = $5 \
+                      WHERE id = $1 AND volume = $2 AND pyramid = $3 AND deleted = 0";
+        let values = [
+            tile.id.0.into(),
+            self.volume.into(),
+            (&tile.pyramid).into(),
+            position.into(),
+            self.revision.into(),
+        ];
         self.run(update, &values).await?;
         Ok(())
+    }
+
+    /// Takes it as said that a tile lies where it does, of which nothing tells any more what brought it there.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn confirm(&mut self, tile: &Tile) -> Result<(), CatalogError> {
+        let at = place(self.extent, tile.section, tile.size, tile.transform);
+        self.log_change(tile.id, at, at, ChangeReason::Transform)
+            .await?;
+        let update = "UPDATE tiles SET revision = $4 \
+                      WHERE id = $1 AND volume = $2 AND revision = $3 AND deleted = 0";
+        let values = [
+            tile.id.0.into(),
+            self.volume.into(),
+            tile.revision.into(),
+            self.revision.into(),
+        ];
+        self.run(update, &values).await?;
+        Ok(())
+    }
+
+    /// Tells those who follow the volume that what is seen of a section may be another everywhere. That is a change of no tile.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn show_again(&mut self, section: u32) -> Result<(), CatalogError> {
+        /// Less than all numbers of tiles.
+        const NONE: TileId = TileId(0);
+        let corner = UVec3::new(0, 0, section);
+        let end = self.extent.truncate().extend(section.saturating_add(1));
+        let whole = VoxelBox::new(corner, end);
+        self.log_change(NONE, None, Some(whole), ChangeReason::Tile)
+            .await
     }
 
     /// Has a tile lie elsewhere, if it is still as it was found, whatever else its row says.

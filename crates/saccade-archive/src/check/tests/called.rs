@@ -1,19 +1,22 @@
 //! Rows that have another tile's name, or that of none.
 
+use saccade_core::voxel_box::VoxelBox;
+
 use super::audit::{at, repairs};
 use super::*;
+use crate::acquisition::DeleteRecord;
 
 const NAMED: (FindingKind, Option<Repair>) = (FindingKind::Spoilt, Some(Repair::Renamed));
 
 impl Fixture {
-    /// What each tile shows, and where: all but revisions.
-    async fn shown(&self) -> Vec<(String, String, SectionFromTile, u32)> {
+    /// What each tile shows, where, and of which record: all but revisions.
+    async fn shown(&self) -> Vec<(String, String, SectionFromTile, u32, u64)> {
         let catalog = self.archive.catalog();
         let mut shown = Vec::new();
         for z in catalog.sections_of_tiles(VOLUME).await.unwrap() {
             let tiles = catalog.section_tiles(VOLUME, z).await.unwrap();
             let tiles = tiles.into_iter();
-            shown.extend(tiles.map(|t| (t.name, t.pyramid, t.transform, t.section)));
+            shown.extend(tiles.map(|t| (t.name, t.pyramid, t.transform, t.section, t.position)));
         }
         shown.sort_by(|a, b| a.0.cmp(&b.0));
         shown
@@ -130,6 +133,169 @@ async fn a_name_that_the_row_of_a_deleted_tile_has_goes_back() {
         assert!(fixture.shown().await == before);
         assert_eq!(fixture.look(false).await.findings, []);
     }
+}
+
+/// What is wrong beside its name is found as well, and mended with it.
+#[tokio::test]
+async fn a_row_with_anothers_name_is_held_against_its_own_record() {
+    for spoilt in [
+        "tx = tx + 17",
+        "ty = ty - 1",
+        "a = 0.9, b = 0.1",
+        "position = position + 1",
+        "tx = tx + 17, position = position + 1",
+    ] {
+        for (one, other) in [("t2", "t3"), ("t0", "t5"), ("t2", "bogus")] {
+            let fixture = Fixture::new().await;
+            let before = fixture.shown().await;
+            let row = format!("UPDATE tiles SET {spoilt} WHERE name = '{one}'");
+            fixture.meddle(&[&row]).await;
+            fixture.call(&[(one, other), (other, one)]).await;
+            let report = fixture.look(true).await;
+            assert!(report.findings.iter().all(|f| f.repair.is_some()));
+            assert!(fixture.shown().await == before, "{spoilt}: {one}, {other}");
+            assert_eq!(fixture.look(false).await.findings, [], "{spoilt}");
+        }
+    }
+    // Of another section or size, it is given back to ingest at once.
+    for spoilt in ["section = 3", "width = 100", "channel = 4"] {
+        let fixture = Fixture::new().await;
+        let row = format!("UPDATE tiles SET {spoilt} WHERE name = 't2'");
+        fixture.meddle(&[&row]).await;
+        fixture.call(&[("t2", "t3"), ("t3", "t2")]).await;
+        let repairs = repairs(&fixture.look(true).await);
+        let anew = (FindingKind::Spoilt, Some(Repair::Queued));
+        assert!(
+            repairs.contains(&NAMED) && repairs.contains(&anew),
+            "{repairs:?}"
+        );
+        let catalog = fixture.archive.catalog();
+        let waits = catalog.waiting(VOLUME).await.unwrap();
+        assert_eq!(waits.len(), 1, "{spoilt}");
+        assert_eq!(waits[0].record.tile, "t2");
+    }
+}
+
+/// The row of a tile that is deleted has the name of one that is there, whose own row has that of none.
+#[tokio::test]
+async fn a_tile_that_is_there_is_not_taken_for_one_too_many() {
+    for by_record in [true, false] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        if by_record {
+            let gone = DeleteRecord { tile: "t5".into() };
+            let position = fixture.append(&Record::Delete(gone)).await;
+            catalog.delete_tile(VOLUME, "t5", position).await.unwrap();
+        } else {
+            fixture.delete("t5").await;
+        }
+        let before = fixture.shown().await;
+        fixture.call(&[("t0", "nobody"), ("t5", "t0")]).await;
+        let report = fixture.look(true).await;
+        assert_eq!(repairs(&report)[0], NAMED, "{:?}", report.findings);
+        assert!(fixture.shown().await == before);
+        let there = catalog.holder(VOLUME, "t5").await.unwrap();
+        assert_eq!(there.is_some_and(|row| row.deleted), by_record);
+        if by_record {
+            assert_eq!(fixture.look(false).await.findings, []);
+        }
+    }
+}
+
+/// Of two that are deleted no voxel tells, but what is recorded of them later.
+#[tokio::test]
+async fn deleted_tiles_are_called_as_the_records_that_ended_them() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    let mut held = Vec::new();
+    for tile in ["t0", "t5", "t3"] {
+        let gone = DeleteRecord { tile: tile.into() };
+        let position = fixture.append(&Record::Delete(gone)).await;
+        catalog.delete_tile(VOLUME, tile, position).await.unwrap();
+        held.push(catalog.holder(VOLUME, tile).await.unwrap());
+    }
+    fixture
+        .call(&[("t0", "t5"), ("t5", "t3"), ("t3", "t0")])
+        .await;
+    assert_eq!(
+        repairs(&fixture.look(false).await),
+        [(FindingKind::Spoilt, None); 3]
+    );
+    let named = repairs(&fixture.look(true).await);
+    assert!(
+        !named.is_empty() && named.iter().all(|found| *found == NAMED),
+        "{named:?}"
+    );
+    for (tile, row) in ["t0", "t5", "t3"].into_iter().zip(held) {
+        assert_eq!(catalog.holder(VOLUME, tile).await.unwrap(), row);
+    }
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+/// It decides which of two that are equally near is seen.
+#[tokio::test]
+async fn a_tile_is_of_the_record_of_which_its_pyramid_is() {
+    let fixture = Fixture::new().await;
+    let before = fixture.shown().await;
+    let spoil = "UPDATE tiles SET position = position + 1 WHERE name = 't3'";
+    fixture.meddle(&[spoil]).await;
+    assert_eq!(
+        found(&fixture.look(false).await),
+        [(FindingKind::Spoilt, "t3")]
+    );
+    let mended = [(FindingKind::Spoilt, Some(Repair::Renumbered))];
+    assert_eq!(repairs(&fixture.look(true).await), mended);
+    assert!(fixture.shown().await == before);
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+/// Where the change is lost that would tell, a tile stays, and that is told.
+#[tokio::test]
+async fn what_the_lost_changes_would_tell_is_not_guessed() {
+    for lost in [
+        "DELETE FROM changes WHERE revision = (SELECT revision FROM tiles WHERE name = 't2')",
+        "DELETE FROM changes",
+    ] {
+        let fixture = Fixture::new().await;
+        fixture.meddle(&[lost]).await;
+        // Where all lies as recorded, nothing is in doubt.
+        assert_eq!(fixture.look(false).await.findings, []);
+        fixture
+            .meddle(&["UPDATE tiles SET tx = 100 WHERE name = 't2'"])
+            .await;
+        let report = fixture.look(false).await;
+        assert_eq!(found(&report), [(FindingKind::Spoilt, "t2")]);
+        let reason = &report.findings[0].reason;
+        assert!(reason.contains("the catalog's changes lack"), "{reason}");
+        let stays = [(FindingKind::Spoilt, Some(Repair::Confirmed))];
+        assert_eq!(repairs(&fixture.look(true).await), stays);
+        assert_eq!(fixture.transform("t2").await.elements()[4], 100.0);
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+}
+
+/// Who follows the volume took them for sections without tiles.
+#[tokio::test]
+async fn sections_that_are_counted_again_are_shown_again() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture
+        .meddle(&["DELETE FROM sections WHERE section = 1"])
+        .await;
+    let before = catalog.revision(VOLUME).await.unwrap();
+    let counted = [(FindingKind::Miscounted, Some(Repair::Recounted))];
+    assert_eq!(repairs(&fixture.look(true).await), counted);
+    let changes = catalog.changes_after(VOLUME, before).await.unwrap();
+    let told: Vec<_> = changes.iter().map(|change| change.voxels).collect();
+    let whole = VoxelBox::new(UVec3::new(0, 0, 1), UVec3::new(900, 900, 2));
+    assert_eq!(told, [whole]);
+    assert_eq!(fixture.look(true).await.findings, []);
+    // Nothing of that explains where a tile lies.
+    fixture
+        .meddle(&["UPDATE tiles SET tx = 100 WHERE section = 1"])
+        .await;
+    let moved = [(FindingKind::Spoilt, Some(Repair::Moved)); 2];
+    assert_eq!(repairs(&fixture.look(true).await), moved);
 }
 
 /// What was renamed before a newer image came is not what its record says alone: then nothing is renamed.
