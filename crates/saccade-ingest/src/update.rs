@@ -257,7 +257,7 @@ pub async fn apply(
     // Deletions end what the records said so far, and nothing that they say later.
     let read = catalog.cursor(volume).await.map_err(|e| failed(e, 0))?;
     let position = read.offset.saturating_sub(1);
-    let mut group: Vec<(&Line, bool)> = Vec::new();
+    let mut group: Vec<(&Line, Known)> = Vec::new();
     let mut gone = HashSet::new();
     let mut section = None;
     for line in lines {
@@ -274,9 +274,21 @@ pub async fn apply(
         // A line before may be about to delete it.
         let known = known && !gone.contains(name);
         let now = now.filter(|_| known);
-        if matches!(line.change, Change::Delete(_)) && known {
+        let is_end = matches!(line.change, Change::Delete(_));
+        if is_end && known {
             gone.insert(name);
         }
+        // As when changes are given again of which it is not known whether they took effect.
+        let is_ended = is_end && !known && !gone.contains(name) && {
+            let row = catalog.holder(volume, name).await;
+            row.map_err(|e| failed(e, done))?
+                .is_some_and(|row| row.deleted)
+        };
+        let known = match () {
+            () if known => Known::There,
+            () if is_ended => Known::Ended,
+            () => Known::Nothing,
+        };
         // Lines about nothing belong to whatever is around them.
         let another = now.is_some() && section.is_some() && now != section;
         if group.len() >= MOST || (another && group.len() >= ENOUGH) {
@@ -297,6 +309,17 @@ pub async fn apply(
     Ok(summary)
 }
 
+/// What is known of a line's tile.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Known {
+    /// The volume has it.
+    There,
+    /// It is deleted, as the line says.
+    Ended,
+    /// The volume has none.
+    Nothing,
+}
+
 /// What became of a line.
 enum Outcome {
     Moved,
@@ -310,7 +333,7 @@ enum Outcome {
 async fn transaction(
     catalog: &Catalog,
     volume: &str,
-    lines: &[(&Line, bool)],
+    lines: &[(&Line, Known)],
     position: u64,
 ) -> Result<Summary, CatalogError> {
     let mut summary = Summary::default();
@@ -318,7 +341,8 @@ async fn transaction(
     for (Line { line, change }, known) in lines {
         let tile = change.tile();
         let outcome = match change {
-            _ if !known => Outcome::Unknown,
+            _ if *known == Known::Nothing => Outcome::Unknown,
+            _ if *known == Known::Ended => Outcome::Unchanged,
             Change::Transform(record) => {
                 match commit.transform(tile, record.transform, None).await {
                     Ok(TransformOutcome::Moved) => Outcome::Moved,

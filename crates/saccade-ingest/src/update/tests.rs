@@ -126,6 +126,10 @@ async fn what_is_said_becomes_so_and_what_cannot_be_is_told() {
     }
     assert_eq!(place("s0_0").await, Some(0.0));
     assert_eq!(place("s1_0").await, Some(0.0));
+    // Who does not know whether a deletion took effect says it again.
+    apply_all(&catalog, &[deleted("s1_2")]).await;
+    let again = apply_all(&catalog, &[deleted("s1_2"), deleted("s1_7")]).await;
+    assert_eq!((again.deleted, again.unchanged, again.unknown), (0, 1, 1));
     // What it said before does not bring one back.
     apply_all(&catalog, &[deleted("s1_1")]).await;
     let mut commit = catalog.begin(VOLUME).await.unwrap();
