@@ -408,9 +408,9 @@ impl<F: Folders> Watch<F> {
         let Found { file, place } = such_as?;
         Some(format!(
             "{files} files are named so that others of their folder, or of one whose name says the same, mean the same tiles, such as \
-             {file:?} of tile {}: of such files the one that was found last and can be read counts, and of those of a folder that were \
-             found at once the last by name. Let the pattern say what tells them apart; or take away what is not to be seen, and \
-             touch what is, for a file that is gone leaves its tile: {}",
+             {file:?} of tile {}: of such files the one that was found last and can be read counts, of those that were found at once the \
+             one that was written last. Let the pattern say what tells them apart; or take away what is not to be seen, and touch what is, for a file \
+             that is gone leaves its tile: {}",
             place.name(),
             self.folder.display()
         ))
@@ -461,7 +461,9 @@ impl<F: Folders> Watch<F> {
         let again = self.unread.len().min(self.config.budget);
         let mut all: Vec<_> = self.unread.drain(..again).collect();
         all.extend(new);
-        all.sort_by(|a, b| a.found.file.cmp(&b.found.file));
+        // In the order in which they were written, as who had followed the folder since then would have told of them.
+        let written = |unread: &Unread| unread.stamp.map(|stamp| stamp.modified);
+        all.sort_by(|a, b| { written(a).cmp(&written(b)) }.then(a.found.file.cmp(&b.found.file)));
         let patience = self.config.poll * PATIENCE;
         for mut unread in all {
             // Before anything is read: what changes later is seen to have changed.

@@ -125,6 +125,35 @@ fn looks(watch: &mut Watch<Disk>) {
     while watch.look().unwrap().1 == Next::More {}
 }
 
+/// What is recorded last is seen where two are equally near, and of files that mean one tile: the same for who comes late.
+#[test]
+fn files_that_are_found_at_once_are_told_in_the_order_in_which_they_were_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scope, kept) = (folder.path().join("scope"), folder.path().join("kept"));
+    let order = [
+        "s3/r2_c1_b.tif",
+        "s1/r9_c9_a.tif",
+        "s3/r1_c4_b.tif",
+        "s2/r1_c1_a.tif",
+    ];
+    for (file, age) in order.iter().rev().zip(1..) {
+        let path = scope.join(file);
+        image(&path, 40, 9);
+        let written = SystemTime::now() - Duration::from_secs(100 * age);
+        let file = fs::File::options().write(true).open(&path).unwrap();
+        file.set_modified(written).unwrap();
+    }
+    let config = WatchConfig {
+        budget: 99,
+        ..config()
+    };
+    let mut watch = Watch::open(config, Disk, &scope, &kept).unwrap();
+    looks(&mut watch);
+    let told = told(&kept);
+    let files: Vec<_> = told.iter().map(|tile| file_name(&tile.file)).collect();
+    assert_eq!(files, order);
+}
+
 #[test]
 fn records_are_written_once_also_by_another_process() {
     let folder = tempfile::tempdir().unwrap();

@@ -259,10 +259,13 @@ impl Index {
                 .file_name()
                 .and_then(|name| name.to_str())
                 .unwrap_or_default();
-            is_image_name(name) && !is_listed(name) && wanted.contains(&plain(name))
+            is_image_name(name)
+                && !is_listed(name)
+                && wanted.contains(&plain(name))
+                && may_be_in(path, file)
         })?;
         Some(format!(
-            "{near:?} is called so but for its end or the case of letters; name it in the list as it is called"
+            "{near:?} is called so but for its end or the case of letters; if that is meant, have the list name it"
         ))
     }
 
@@ -398,6 +401,17 @@ impl Index {
         // Folders whose names are text hold only such.
         met.extend(path.to_str().map(ToOwned::to_owned));
     }
+}
+
+/// Whether an image may be in the folders that a list names for it, as far as both say and but for the case of letters.
+fn may_be_in(path: &Path, file: &str) -> bool {
+    let named = file.rsplit(['/', '\\']).skip(1);
+    let named = named.filter(|folder| !matches!(*folder, "" | "."));
+    let folders = path.components().rev().skip(1);
+    { folders.zip(named) }.all(|(folder, named)| {
+        let folder = folder.as_os_str().to_string_lossy();
+        folder.to_lowercase() == named.to_lowercase()
+    })
 }
 
 impl Files for Index {

@@ -171,19 +171,25 @@ impl<F: Folders> ListWatch<F> {
         })
     }
 
-    /// Finds out anew how far the solution's frame is from the list's, unless all tiles that are there lie where it
-    /// says: then it knows more of them at most.
+    /// Finds out anew how far the solution's frame is from the list's, unless of the tiles that are there some lie where it says, and the
+    /// others where the list has them: then it knows more of them at most.
     fn align(&mut self, listing: &Listing) -> Result<(), ListError> {
         let raw = self.raw(listing);
         let Some((adopted, frame)) = self.adopted.as_mut().zip(self.frame.as_ref()) else {
             return Ok(());
         };
-        let there = listing.tiles.iter().filter_map(|named| {
-            let told = self.tiles.get(&*named.name)?.told.as_ref()?;
-            Some((told.transform, frame.place(adopted.place(named)?)))
-        });
-        let mut there = there.peekable();
-        if there.peek().is_some() && there.all(|(told, now)| same_place(told, now)) {
+        let (mut same, mut moved) = (false, false);
+        for named in &listing.tiles {
+            let told = { self.tiles.get(&*named.name) }.and_then(|tile| tile.told.as_ref());
+            let Some((told, now)) = told.zip(adopted.place(named)) else {
+                continue;
+            };
+            match same_place(told.transform, frame.place(now)) {
+                true => same = true,
+                false => moved |= !same_place(told.transform, frame.place(named.stage)),
+            }
+        }
+        if same && !moved {
             return Ok(());
         }
         if let Some(offset) = offset(&adopted.solution, raw)

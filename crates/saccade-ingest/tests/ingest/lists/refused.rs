@@ -33,7 +33,10 @@ fn why_no_image_at_all_is_there_is_told() {
     assert!(matches!(refused, ListError::NoImages { .. }), "{refused:?}");
     assert!(refused.to_string().contains(why), "{refused}");
     // It may be there by another spelling; what is no image is none.
-    for (file, listed) in [("deep/B.TIF", "b.tif"), ("deep/c.jpeg", "u/c.tif")] {
+    for (file, listed) in [
+        ("deep/B.TIF", "b.tif"),
+        ("Deep/c.jpeg", "/scope/deep/c.tif"),
+    ] {
         write(&list, format!("{listed} 0 0 0\n"));
         let at = scope.file(file);
         fs::create_dir_all(at.parent().unwrap()).unwrap();
@@ -44,6 +47,18 @@ fn why_no_image_at_all_is_there_is_told() {
         let told = refusal().to_string();
         let why = format!("({file:?} is called so but for its end or the case of letters");
         assert!(told.contains(&why), "{told}");
+        // That of another folder is another one.
+        write(
+            &list,
+            format!(
+                "{} 0 0 0\n",
+                listed
+                    .replace("deep/", "other/")
+                    .replace("b.tif", "other/b.tif")
+            ),
+        );
+        let told = refusal().to_string();
+        assert!(!told.contains("is called so"), "{told}");
     }
 }
 

@@ -105,6 +105,78 @@ async fn registration_that_begins_elsewhere_is_the_same() {
     assert_eq!((&all[..3], &all[3][..]), (&other[..], &[234.0, 48.0][..]));
 }
 
+/// Neither by itself nor by what it says of tiles that lay where the list has them so far.
+#[tokio::test]
+async fn registration_that_knows_more_tiles_moves_no_others() {
+    let scope = Scope::new();
+    let list = scope.file("TileConfiguration.txt");
+    let registered = scope.file("TileConfiguration.registered.txt");
+    let archive = archive(&scope.0.path().join("archive")).await;
+    let names = ["a", "b", "c", "d", "e"];
+    for (seed, name) in (0..).zip(names) {
+        scope.image(name, seed);
+    }
+    let tiles = |places: &[[f64; 2]]| {
+        let lines = { names.iter().zip(places) }
+            .map(|(name, [x, y])| format!("{name}.tif; ; ({x}, {y})\n"));
+        format!("dim = 2\n{}", lines.collect::<String>())
+    };
+    let stage = [60.0, 90.0, 120.0, 150.0, 180.0].map(|x| [x, 60.0]);
+    write(&list, tiles(&stage));
+    let solved = [
+        [1060.0, 66.0],
+        [1092.0, 67.0],
+        [1119.0, 64.0],
+        [1155.0, 70.0],
+        [1190.0, 90.0],
+    ];
+    let config = || ListConfig {
+        origin: Some(DVec2::ZERO),
+        ..roomy(&list)
+    };
+    let mut before: Vec<Vec<f64>> = Vec::new();
+    for known in 3..=5 {
+        write(&registered, tiles(&solved[..known]));
+        scope.once(config(), &archive).await;
+        let tiles = seen(&archive).await;
+        let places: Vec<_> = tiles
+            .values()
+            .map(|tile| tile.transform[4..].to_vec())
+            .collect();
+        // Those that are known lie to each other as registration says.
+        for (place, at) in places.iter().zip(&solved[..known]) {
+            assert_eq!(
+                [place[0] - places[0][0], place[1] - places[0][1]],
+                [at[0] - 1060.0, at[1] - 66.0]
+            );
+        }
+        assert!(
+            before.is_empty() || before[..known - 1] == places[..known - 1],
+            "{known}"
+        );
+        assert_eq!(
+            places[known..],
+            { stage[known..].iter() }
+                .map(|at| at.to_vec())
+                .collect::<Vec<_>>()
+        );
+        before = places;
+    }
+    // Elsewhere, they are placed anew, wherever it counts from.
+    let other = solved.map(|[x, y]| [x - 500.0, if x > 1100.0 { y + 9.0 } else { y }]);
+    write(&registered, tiles(&other));
+    scope.once(config(), &archive).await;
+    let tiles = seen(&archive).await;
+    let places: Vec<_> = tiles
+        .values()
+        .map(|tile| tile.transform[4..].to_vec())
+        .collect();
+    assert!(
+        places[0] != before[0] && (places[0][0] - 60.0).abs() < 20.0,
+        "{places:?}"
+    );
+}
+
 /// Fiji may have been given some of the tiles only, or leave out what it cannot place.
 #[tokio::test]
 async fn registration_of_some_tiles_moves_those() {
