@@ -49,7 +49,17 @@ fn the_volume_stops_and_goes_on_whole() {
         // The last one of the file comes with closing, when all is acknowledged and stays in the log.
         for number in [1, 2, syncs / 2, syncs - 2] {
             let archive = folder.path().join(format!("archive{number}"));
-            let stopped = ingest(&archive, file, number.max(1));
+            let mut number = number.max(1);
+            let stopped = loop {
+                let stopped = ingest(&archive, file, number);
+                let synced = std::fs::read_to_string(&count).unwrap();
+                // Of a run that had less to sync than the first one, it may be the last.
+                if !stopped.status.success() || synced.parse::<u32>().unwrap() > number {
+                    break stopped;
+                }
+                std::fs::remove_dir_all(&archive).unwrap();
+                number = number.saturating_sub(2).max(1);
+            };
             let told = stderr(&stopped);
             let place = format!("{file}, sync {number} of {syncs}: {told}");
             assert_eq!(stopped.status.code(), Some(1), "{place}");
