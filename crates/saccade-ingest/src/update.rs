@@ -279,11 +279,13 @@ pub async fn apply(
             gone.insert(name);
         }
         // As when changes are given again of which it is not known whether they took effect.
-        let is_ended = is_end && !known && !gone.contains(name) && {
-            let row = catalog.holder(volume, name).await;
-            row.map_err(|e| failed(e, done))?
-                .is_some_and(|row| row.deleted)
-        };
+        let is_ended = is_end
+            && !known
+            && (gone.contains(name) || {
+                let row = catalog.holder(volume, name).await;
+                row.map_err(|e| failed(e, done))?
+                    .is_some_and(|row| row.deleted)
+            });
         let known = match () {
             () if known => Known::There,
             () if is_ended => Known::Ended,
@@ -314,7 +316,7 @@ pub async fn apply(
 enum Known {
     /// The volume has it.
     There,
-    /// It is deleted, as the line says.
+    /// It is deleted, as the line says, or an earlier one is about to.
     Ended,
     /// The volume has none.
     Nothing,

@@ -130,6 +130,8 @@ async fn what_is_said_becomes_so_and_what_cannot_be_is_told() {
     apply_all(&catalog, &[deleted("s1_2")]).await;
     let again = apply_all(&catalog, &[deleted("s1_2"), deleted("s1_7")]).await;
     assert_eq!((again.deleted, again.unchanged, again.unknown), (0, 1, 1));
+    let twice = apply_all(&catalog, &[deleted("s0_1"), deleted("s0_1")]).await;
+    assert_eq!((twice.deleted, twice.unchanged, twice.unknown), (1, 1, 0));
     // What it said before does not bring one back.
     apply_all(&catalog, &[deleted("s1_1")]).await;
     let mut commit = catalog.begin(VOLUME).await.unwrap();
