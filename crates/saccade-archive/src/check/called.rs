@@ -1,4 +1,4 @@
-//! Rows that have another tile's name, or that of none.
+//! Rows that have another tile's name, or that of none, or the number of another record.
 
 use std::borrow::Cow;
 use std::hash::BuildHasher as _;
@@ -227,9 +227,7 @@ impl Check<'_> {
             Record::Transform(_) | Record::Tile(_) => None,
         }
     }
-}
 
-impl Check<'_> {
     /// A tile whose row says that its image is of another record than the pyramid has it, and its newest record is; of two that are
     /// equally near, that decides which one is seen.
     pub(super) async fn misnumbered(
