@@ -9,7 +9,7 @@
 //! What is said of tiles of one section, line after line, becomes so at once. Small groups share a transaction; none has
 //! more than [`MOST`] lines, so that ingest is not kept waiting.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io::{self, BufRead, Read as _};
 
 use saccade_archive::acquisition::{DeleteRecord, Record, TransformRecord};
@@ -259,8 +259,12 @@ pub async fn apply(
     let position = read.offset.saturating_sub(1);
     let mut group: Vec<(&Line, Known)> = Vec::new();
     let mut gone = HashSet::new();
+    let ends = lines.iter().enumerate();
+    let ends = ends.filter(|(_, line)| matches!(line.change, Change::Delete(_)));
+    // The last one of each tile.
+    let ends: HashMap<_, _> = ends.map(|(at, line)| (line.change.tile(), at)).collect();
     let mut section = None;
-    for line in lines {
+    for (at, line) in lines.iter().enumerate() {
         if cancel.is_cancelled() {
             break;
         }
@@ -278,17 +282,18 @@ pub async fn apply(
         if is_end && known {
             gone.insert(name);
         }
-        // As when changes are given again of which it is not known whether they took effect.
-        let is_ended = is_end
-            && !known
+        let is_deleted = !known
             && (gone.contains(name) || {
                 let row = catalog.holder(volume, name).await;
                 row.map_err(|e| failed(e, done))?
                     .is_some_and(|row| row.deleted)
             });
+        // As when changes are given again of which it is not known whether they took effect.
+        let is_ended = is_deleted && ends.get(name).is_some_and(|end| at <= *end);
         let known = match () {
             () if known => Known::There,
             () if is_ended => Known::Ended,
+            () if is_deleted => Known::Deleted,
             () => Known::Nothing,
         };
         // Lines about nothing belong to whatever is around them.
@@ -316,8 +321,10 @@ pub async fn apply(
 enum Known {
     /// The volume has it.
     There,
-    /// It is deleted, as the line says, or an earlier one is about to.
+    /// It is deleted, as this line or a later one says, or an earlier one is about to.
     Ended,
+    /// It is deleted, or an earlier line is about to, and is to lie somewhere.
+    Deleted,
     /// The volume has none.
     Nothing,
 }
@@ -328,6 +335,7 @@ enum Outcome {
     Unchanged,
     Deleted,
     Unknown,
+    Gone,
     Kept,
     Refused(String),
 }
@@ -345,6 +353,7 @@ async fn transaction(
         let outcome = match change {
             _ if *known == Known::Nothing => Outcome::Unknown,
             _ if *known == Known::Ended => Outcome::Unchanged,
+            _ if *known == Known::Deleted => Outcome::Gone,
             Change::Transform(record) => {
                 match commit.transform(tile, record.transform, None).await {
                     Ok(TransformOutcome::Moved) => Outcome::Moved,
@@ -370,6 +379,12 @@ async fn transaction(
             Outcome::Unknown => {
                 summary.unknown += 1;
                 summary.note(format!("line {line}: the volume has no tile {tile:?}"));
+            }
+            Outcome::Gone => {
+                summary.unknown += 1;
+                summary.note(format!(
+                    "line {line}: tile {tile:?} was deleted; append its record once more, or list it again, and it is back"
+                ));
             }
             // Or another process deleted it just now.
             Outcome::Kept => {

@@ -132,6 +132,19 @@ async fn what_is_said_becomes_so_and_what_cannot_be_is_told() {
     assert_eq!((again.deleted, again.unchanged, again.unknown), (0, 1, 1));
     let twice = apply_all(&catalog, &[deleted("s0_1"), deleted("s0_1")]).await;
     assert_eq!((twice.deleted, twice.unchanged, twice.unknown), (1, 1, 0));
+    // Also of one that was moved before, not of one that is to lie somewhere after its end.
+    let moved_and_ended = [moved("s0_2", 7.0), deleted("s0_2")];
+    let first = apply_all(&catalog, &moved_and_ended).await;
+    assert_eq!((first.moved, first.deleted, first.unknown), (1, 1, 0));
+    let again = apply_all(&catalog, &moved_and_ended).await;
+    assert_eq!((again.unchanged, again.unknown), (2, 0));
+    let after = apply_all(&catalog, &[deleted("s0_2"), moved("s0_2", 7.0)]).await;
+    assert_eq!((after.unchanged, after.unknown), (1, 1));
+    let told = &after.not_applied[0];
+    assert!(
+        told.contains("line 2") && told.contains("was deleted"),
+        "{told}"
+    );
     // What it said before does not bring one back.
     apply_all(&catalog, &[deleted("s1_1")]).await;
     let mut commit = catalog.begin(VOLUME).await.unwrap();
