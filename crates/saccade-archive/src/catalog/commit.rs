@@ -23,6 +23,11 @@ pub enum TileOutcome {
     New,
     /// It took the place of an older one of its name, whose pyramid is retired.
     Replaced,
+    /// So it did, of one that was in another section.
+    Elsewhere {
+        /// The section that it was in.
+        from: u32,
+    },
     /// The volume has a newer one of its name: nothing changed.
     Superseded,
 }
@@ -197,7 +202,12 @@ impl<'c> Commit<'c> {
         if let Some(pyramid) = existing.pyramid.filter(|p| *p != tile.pyramid) {
             self.retire(&pyramid, now).await?;
         }
-        Ok(TileOutcome::Replaced)
+        let from = existing.section.filter(|from| *from != tile.section);
+        Ok(
+            from.map_or(TileOutcome::Replaced, |from| TileOutcome::Elsewhere {
+                from,
+            }),
+        )
     }
 
     /// A tile is no more where it was.

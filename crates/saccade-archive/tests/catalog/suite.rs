@@ -117,10 +117,9 @@ pub(crate) async fn a_moved_tile_changes_its_old_and_its_new_place(place: &Place
         .await
         .unwrap();
     // Imaged again in another section.
-    catalog
-        .commit_tile("v", &tile("a", 4, at(70.0, 60.0), 7))
-        .await
-        .unwrap();
+    let again = tile("a", 4, at(70.0, 60.0), 7);
+    let outcome = catalog.commit_tile("v", &again).await.unwrap();
+    assert_eq!(outcome, TileOutcome::Elsewhere { from: 2 });
     let boxes: Vec<_> = all_changes(&catalog)
         .await
         .iter()

@@ -74,6 +74,8 @@ impl SetAside {
 #[derive(Default)]
 pub(super) struct Done {
     pub(super) summary: Summary,
+    /// The first tile that took the place of one in another section, in words.
+    elsewhere: Option<String>,
     /// Pyramids that no tile names.
     orphans: Vec<String>,
     pub(super) notices: Vec<String>,
@@ -95,6 +97,15 @@ impl Enter<'_> {
                 log::warn!("cannot delete the unused pyramid {orphan}: {e}");
             }
         }
+        // Once a run: where names mean several tiles, all but the first sections say so.
+        if let Some(told) = done
+            .elsewhere
+            .take()
+            .filter(|_| self.summary.elsewhere == 0)
+        {
+            progress.notice(&told);
+        }
+        self.summary.elsewhere += done.summary.elsewhere;
         self.summary.tiles += done.summary.tiles;
         self.summary.pixels += done.summary.pixels;
         self.summary.moved += done.summary.moved;
@@ -156,6 +167,14 @@ impl Enter<'_> {
     }
 }
 
+/// What is said of a tile that was in another section before.
+fn one_name(tile: &str, from: u32, to: u32) -> String {
+    format!(
+        "warn: tile {tile:?} was in section {from}, and its newest record has it in section {to}: it is no more where it was, for a name means one \
+         tile of the whole volume. If these are two tiles, name them so in the records, such as \"s{to}_{tile}\""
+    )
+}
+
 impl Done {
     /// Enters what became of a record.
     pub(super) async fn apply(
@@ -166,12 +185,17 @@ impl Done {
     ) -> Result<(), CatalogError> {
         match outcome {
             Outcome::Tile { tile, pixels } => match commit.tile(tile, now).await? {
-                TileOutcome::New | TileOutcome::Replaced => {
+                TileOutcome::Superseded => self.orphans.push(tile.pyramid.clone()),
+                entered => {
                     self.summary.tiles += 1;
                     self.summary.pixels += pixels;
                     self.changes.push(Change::Ended(tile.name.clone()));
+                    if let TileOutcome::Elsewhere { from } = entered {
+                        self.summary.elsewhere += 1;
+                        self.elsewhere
+                            .get_or_insert_with(|| one_name(&tile.name, from, tile.section));
+                    }
                 }
-                TileOutcome::Superseded => self.orphans.push(tile.pyramid.clone()),
             },
             Outcome::Transform { record, position } => {
                 let misplaced = |reason| Quarantined {

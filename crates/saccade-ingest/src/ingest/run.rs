@@ -42,6 +42,8 @@ const SETTLING: Duration = Duration::from_secs(5);
 pub struct Summary {
     /// Tiles entered, or entered again.
     pub tiles: u64,
+    /// Those of them that took the place of one of their name in another section.
+    pub elsewhere: u64,
     /// Their pixels.
     pub pixels: u64,
     /// Tiles moved by transform records.

@@ -44,6 +44,7 @@ async fn pixels_arrive_as_they_left() {
         summary,
         Summary {
             tiles: 4,
+            elsewhere: 0,
             pixels: count,
             moved: 0,
             deleted: 0,

@@ -448,6 +448,7 @@ impl Ingest {
         shown.finish();
         let Summary {
             tiles,
+            elsewhere,
             moved,
             deleted,
             quarantined,
@@ -470,6 +471,11 @@ impl Ingest {
         }
         archive.catalog().close().await;
         let mut done = format!("{tiles} tiles taken in, {moved} moved, {quarantined} set aside");
+        if elsewhere > 0 {
+            done.push_str(&format!(
+                ", {elsewhere} in the place of one of their name in another section"
+            ));
+        }
         if deleted > 0 {
             done.push_str(&format!(", {deleted} deleted"));
         }
