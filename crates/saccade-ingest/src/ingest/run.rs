@@ -288,8 +288,11 @@ impl Ingest<'_> {
                 .tell(Part::Images, waits_for.as_deref(), self.clock().now());
             self.delete_retired().await?;
             let (queued, waiting) = self.count().await?;
-            self.left
-                .store(queued + self.reader.remaining_lines(), Ordering::Relaxed);
+            // Whoever read them: what others did is in the queue.
+            let cursor = || self.archive.catalog().cursor(self.context.volume);
+            let read = self.context.retry(cursor).await?;
+            let remaining = self.reader.at(read).remaining_lines();
+            self.left.store(queued + remaining, Ordering::Relaxed);
             self.context.progress.update(&state(
                 &self.summary,
                 self.meter.mpixel_per_s(self.clock().monotonic()),

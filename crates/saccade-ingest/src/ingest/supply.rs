@@ -117,9 +117,9 @@ impl Supply<'_> {
         let (options, progress) = (self.options, self.context.progress);
         let (catalog, volume) = (self.archive.catalog(), self.context.volume);
         let batch = options.batch.max(1);
+        let (queued, _) = self.context.retry(|| catalog.queued(volume)).await?;
         // Another worker may have read on.
         let from = self.catch_up().await?;
-        let (queued, _) = self.context.retry(|| catalog.queued(volume)).await?;
         if queued >= batch as u64 {
             return Ok(false);
         }
