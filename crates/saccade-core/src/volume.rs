@@ -119,7 +119,7 @@ pub enum VolumeError {
     },
     /// The name cannot be used in addresses and file names.
     #[error(
-        "{name:?} cannot name a volume: use 1 to 100 letters, digits, '-', '_' and '.', and do not \
+        "{name:?} cannot name a volume: use 1 to 100 ASCII letters, digits, '-', '_' and '.', and do not \
          begin with '.'"
     )]
     Name {

@@ -44,6 +44,7 @@ mod again;
 mod list;
 mod listed;
 mod looking;
+mod moved;
 pub(crate) mod no_folder;
 mod no_image;
 mod pattern;
@@ -77,6 +78,8 @@ pub struct WatchConfig {
     pub poll: Duration,
     /// Folders and files asked per look.
     pub budget: usize,
+    /// Whether the folder is the one that was watched, and has moved, whatever the times of its files say.
+    pub moved: bool,
 }
 
 impl WatchConfig {
@@ -118,6 +121,22 @@ pub enum WatchError {
         differences: String,
         /// What is kept.
         path: PathBuf,
+    },
+    /// The folder that was watched is gone, and this one, elsewhere, is another.
+    #[error(
+        "the folder that is followed under this name, {}, is not there any more, and this one is another: of {compared} images that \
+         both have, none has the size and time that it had. Take it in under another name (`saccade ingest --volume NAME`) or into another \
+         archive; if it is that folder, and its files got other times as it was copied, say --moved: {}",
+        was.display(),
+        folder.display()
+    )]
+    Another {
+        /// Where the folder was.
+        was: PathBuf,
+        /// This one.
+        folder: PathBuf,
+        /// Images that were compared.
+        compared: usize,
     },
 }
 
@@ -279,17 +298,13 @@ impl<F: Folders> Watch<F> {
         if info.as_ref() != Some(&config.info) {
             config.info.write(kept)?;
         }
-        let led_elsewhere = link(&folder, kept)?;
+        let scanner = Scanner::new(folders, &folder, config.pattern.clone());
+        let key = |file: &str| scanner.key(file);
+        let stamps = moved::go_on(scanner.folders(), &folder, kept, config.moved, key)?;
         // Those of earlier versions did not keep them.
         if settings.as_ref() != Some(&now) {
             now.write_to(kept.join(SETTINGS))?;
         }
-        let stamps = Stamps::new(kept);
-        if led_elsewhere {
-            // Copies are other files.
-            stamps.forget();
-        }
-        let scanner = Scanner::new(folders, &folder, config.pattern.clone());
         let mut watch = Self {
             config,
             scanner,

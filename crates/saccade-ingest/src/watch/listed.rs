@@ -41,7 +41,7 @@ use super::again::Again;
 use super::list::List;
 use super::stamp::{Seen, Stamp};
 use super::stamps::Stamps;
-use super::{Folders, Next, Untold, WatchError, link};
+use super::{Folders, Next, Untold, WatchError, moved};
 use crate::held_up::HeldUp;
 use frame::Frame;
 use index::{Index, Sought, base, key, names};
@@ -195,12 +195,8 @@ impl<F: Folders> ListWatch<F> {
             source,
             path: kept.to_owned(),
         })?;
-        let stamps = Stamps::new(kept);
         let frame = Frame::open(&config, &folder, kept)?;
-        if link(&folder, kept)? {
-            // Copies are other files.
-            stamps.forget();
-        }
+        let stamps = moved::go_on(&disk, &folder, kept, config.moved, key)?;
         let now = disk.now();
         let mut watch = Self {
             once: false,

@@ -385,9 +385,18 @@ impl<F: Folders> Scanner<F> {
         self.told_key(file);
     }
 
-    /// The same; by which it is remembered.
+    /// By what a file is remembered.
+    pub(super) fn key(&self, file: &str) -> u64 {
+        self.hasher.hash_one(file)
+    }
+
+    pub(super) fn folders(&self) -> &F {
+        &self.folders
+    }
+
+    /// Says that a file was told of by an earlier process; by which it is remembered.
     pub(super) fn told_key(&mut self, file: &str) -> u64 {
-        let key = self.hasher.hash_one(file);
+        let key = self.key(file);
         self.told.insert(key, None);
         key
     }

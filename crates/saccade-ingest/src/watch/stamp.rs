@@ -91,8 +91,23 @@ impl Seen {
     /// place, of the same length and time, has another number and was changed. Neither alone says anything: links and
     /// permissions change a file, and some shares number files as they go.
     pub(super) fn is_replaced_by(self, now: Self) -> bool {
-        let moved_in = self.number != now.number && self.changed != now.changed;
-        self.content != now.content || moved_in
+        let is_known = self.number != 0 || self.changed != 0;
+        let moved_in = is_known && self.number != now.number && self.changed != now.changed;
+        !self.has_content_of(now) || moved_in
+    }
+
+    /// Whether a file of one stamp has the length and time of that of another.
+    pub(super) fn has_content_of(self, other: Self) -> bool {
+        self.content == other.content
+    }
+
+    /// Without what another file of the same content has otherwise.
+    pub(super) fn of_any_file(self) -> Self {
+        Self {
+            changed: 0,
+            number: 0,
+            ..self
+        }
     }
 
     pub(super) fn to_bits(self) -> u64 {
@@ -136,6 +151,10 @@ mod tests {
             assert_eq!(before.is_replaced_by(now), replaced, "{then:?}");
             assert_eq!(Seen::from_bits(now.to_bits()), now);
         }
+        // On another disk, where it was copied to, and what comes into its place there.
+        let known = Seen::of(&first).of_any_file();
+        assert!(!known.is_replaced_by(Seen::of(&stamp(9, 5, 7, 3))));
+        assert!(known.is_replaced_by(Seen::of(&stamp(9, 6, 7, 3))));
         for (age, young) in [(0, true), (29, true), (31, false)] {
             assert_eq!(first.is_young(at(5 + age)), young, "{age}");
             assert_eq!(stamp(9, 1, 5, 1).is_young(at(5 + age)), young, "{age}");

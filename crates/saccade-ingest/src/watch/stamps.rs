@@ -28,7 +28,19 @@ impl Stamps {
         }
     }
 
-    /// Forgets all, because the files were moved.
+    /// Keeps what is the same of copies elsewhere, because the files were moved. What cannot be kept is forgotten.
+    pub(super) fn keep_content(&self) {
+        let mut all = Vec::new();
+        self.each(|key, seen| all.push([seen.of_any_file().to_bits(), key].map(u64::to_le_bytes)));
+        let part = self.path.with_extension("part");
+        let bytes = all.as_flattened().as_flattened();
+        if let Err(e) = fs::write(&part, bytes).and_then(|()| fs::rename(&part, &self.path)) {
+            log::warn!("cannot write {}: {e}", self.path.display());
+            self.forget();
+        }
+    }
+
+    /// Forgets all, because the files were moved, and may have other times.
     pub(super) fn forget(&self) {
         match fs::remove_file(&self.path) {
             Err(e) if e.kind() != io::ErrorKind::NotFound => {
@@ -107,7 +119,11 @@ pub(crate) fn fuzz(bytes: &[u8]) {
         (u64::MAX, Seen::from_bits(u64::MAX)),
     ];
     stamps.add(&added);
-    assert_eq!(all(&stamps), [before, added.to_vec()].concat());
+    let all_now = [before, added.to_vec()].concat();
+    assert_eq!(all(&stamps), all_now);
+    stamps.keep_content();
+    let content = all_now.iter().map(|(key, seen)| (*key, seen.of_any_file()));
+    assert_eq!(all(&stamps), content.collect::<Vec<_>>());
     stamps.forget();
     assert_eq!(all(&stamps), []);
 }

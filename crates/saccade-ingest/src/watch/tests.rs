@@ -1,5 +1,6 @@
 mod again;
 mod conformance;
+mod moved;
 mod scanner;
 
 use std::path::Path;
@@ -104,6 +105,7 @@ fn config() -> WatchConfig {
         first: 1,
         poll: Duration::from_millis(500),
         budget: 7,
+        moved: false,
     }
 }
 

@@ -39,6 +39,7 @@ fn config() -> WatchConfig {
         first: 0,
         poll: Duration::from_millis(20),
         budget: 40,
+        moved: false,
     }
 }
 

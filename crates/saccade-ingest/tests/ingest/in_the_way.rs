@@ -54,6 +54,7 @@ impl Beside {
             first: 0,
             poll: Duration::from_millis(20),
             budget: 40,
+            moved: false,
         };
         Watch::open(config, Disk, &self.at(""), &self.kept()).unwrap()
     }
@@ -301,6 +302,7 @@ fn listed(beside: &Beside, lines: &str) -> ListWatch<Disk> {
         rest: Duration::ZERO,
         drop_after: Duration::ZERO,
         budget: 30,
+        moved: false,
     };
     ListWatch::open(config, Disk, &beside.at(""), &beside.kept()).unwrap()
 }

@@ -4,6 +4,7 @@ mod channels;
 mod encoded;
 mod growing;
 mod late;
+mod moved;
 mod power_cuts;
 mod refused;
 mod registration;
@@ -49,6 +50,7 @@ fn config(list: &Path) -> ListConfig {
         rest: Duration::from_millis(60),
         drop_after: Duration::from_millis(240),
         budget: 30,
+        moved: false,
     }
 }
 

@@ -82,6 +82,10 @@ pub(crate) struct Bare {
     #[arg(long, value_name = "PATTERN", value_parser = Pattern::of_channels, conflicts_with = "pattern")]
     channel_in: Option<Pattern>,
 
+    /// The folder is the one that was followed under this name and has moved here, though its files have other times, as copies may
+    #[arg(long)]
+    moved: bool,
+
     /// Bits of a voxel, 8 or 16, with --pattern or a list [default: 8, or as the images have that are listed at first]
     #[arg(long, value_name = "NUMBER", value_parser = clap::value_parser!(u8).range(8..=16))]
     bits: Option<u8>,
@@ -217,6 +221,7 @@ impl Bare {
             (self.drop_after.is_some(), "--drop-after"),
             (!self.channels.is_empty(), "--channels"),
             (self.channel_in.is_some(), "--channel-in"),
+            (self.moved, "--moved"),
         ];
         let first = given.into_iter().find(|(given, _)| *given);
         first.map(|(_, option)| option)
@@ -251,6 +256,7 @@ impl Bare {
             first: self.first.unwrap_or(0),
             poll: IngestOptions::DEFAULT.poll,
             budget: WatchConfig::BUDGET,
+            moved: self.moved,
         }))
     }
 
@@ -277,6 +283,7 @@ impl Bare {
             rest: ListConfig::REST,
             drop_after: self.settled(),
             budget: WatchConfig::BUDGET,
+            moved: self.moved,
         };
         let mut info = AcquisitionInfo::new(name, UVec3::ONE, voxel_nm);
         info.channels.clone_from(&self.channels);

@@ -120,8 +120,11 @@ fn named_after(folder: &Path) -> String {
         .file_name()
         .map(|name| name.to_string_lossy().into_owned());
     let name = name.filter(|name| check_name(name).is_ok());
-    name.unwrap_or_else(|| "volume".to_owned())
+    name.unwrap_or_else(|| NAMELESS.to_owned())
 }
+
+/// The volume of a folder by whose name none can be called.
+const NAMELESS: &str = "volume";
 
 /// What the command ends with when all was done once, but not all could be taken in.
 const SET_ASIDE: u8 = 3;
@@ -403,6 +406,12 @@ impl Ingest {
         let mut watching = None;
         let mut missing = None;
         if !matches!(followed, Followed::Records) {
+            if self.volume.is_none() && name == NAMELESS && !self.acquisition.ends_with(NAMELESS) {
+                say(&format!(
+                    "the volume is called {NAMELESS:?}, for the folder's name cannot name one (ASCII letters, digits, '-', '_' and '.'): \
+                     --volume gives it another, and each further such folder needs one"
+                ));
+            }
             let Some(kept) = kept else {
                 anyhow::bail!(
                     "what is found in a folder without records is kept beside the pyramids or the catalog, which \

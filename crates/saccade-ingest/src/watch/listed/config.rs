@@ -47,6 +47,8 @@ pub struct ListConfig {
     pub drop_after: Duration,
     /// Folders and files asked per look.
     pub budget: usize,
+    /// Whether the folder is the one that was followed, and has moved, whatever the times of its files say.
+    pub moved: bool,
 }
 
 impl ListConfig {

@@ -1,0 +1,86 @@
+//! Folders that lie elsewhere than they did.
+
+use super::*;
+
+const FILES: [&str; 3] = ["s3/r2_c1_b.tif", "s3/r2_c2_b.tif", "s4/r1_c1_a.tif"];
+
+/// Images that were written so many seconds ago.
+fn fill(folder: &Path, ago: u64) {
+    for file in FILES {
+        let path = folder.join(file);
+        image(&path, 40, 9);
+        set_age(&path, ago);
+    }
+}
+
+fn set_age(path: &Path, ago: u64) {
+    let written = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000 - ago);
+    let file = fs::File::options().write(true).open(path).unwrap();
+    file.set_modified(written).unwrap();
+}
+
+fn open(folder: &Path, kept: &Path, moved: bool) -> Result<Watch<Disk>, WatchError> {
+    let config = WatchConfig {
+        budget: 99,
+        moved,
+        ..config()
+    };
+    Watch::open(config, Disk, folder, kept)
+}
+
+#[test]
+fn a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).join("scan");
+    let kept = folder.path().join("kept");
+    fill(&at("first"), 500);
+    looks(&mut open(&at("first"), &kept, false).unwrap());
+    assert_eq!(told(&kept).len(), 3);
+
+    // While it is there, another is refused in any case.
+    fill(&at("another"), 100);
+    let refused = open(&at("another"), &kept, true).err().unwrap();
+    assert!(matches!(refused, WatchError::Other { .. }), "{refused}");
+
+    // Copied with its times, and one is imaged again.
+    fill(&at("copy"), 500);
+    fs::remove_dir_all(folder.path().join("first")).unwrap();
+    let mut watch = open(&at("copy"), &kept, false).unwrap();
+    looks(&mut watch);
+    assert_eq!(told(&kept).len(), 3);
+    set_age(&at("copy").join(FILES[1]), 400);
+    drop(watch);
+    looks(&mut open(&at("copy"), &kept, false).unwrap());
+    let tiles = told(&kept);
+    assert_eq!(tiles.len(), 4);
+    assert!(tiles[3].file.ends_with(FILES[1]));
+    // It moves once more, with one that is imaged again on the way.
+    fs::create_dir(folder.path().join("away")).unwrap();
+    fs::rename(at("copy"), at("away")).unwrap();
+    set_age(&at("away").join(FILES[2]), 300);
+    looks(&mut open(&at("away"), &kept, false).unwrap());
+    let tiles = told(&kept);
+    assert_eq!(tiles.len(), 5);
+    assert!(tiles[4].file.ends_with(FILES[2]));
+
+    fs::remove_dir_all(folder.path().join("away")).unwrap();
+    let refused = open(&at("another"), &kept, false).err().unwrap();
+    let said = refused.to_string();
+    for word in [
+        "of 3 images",
+        "away/scan",
+        "another/scan",
+        "--volume",
+        "--moved",
+    ] {
+        assert!(said.contains(word), "{said}");
+    }
+    // Refused, it is not followed, however often it is tried.
+    assert!(open(&at("another"), &kept, false).is_err());
+    assert_eq!(told(&kept).len(), 5);
+    // Where nothing is there yet, nothing tells.
+    fs::create_dir_all(at("empty")).unwrap();
+    open(&at("empty"), &kept, false).unwrap();
+    fs::remove_dir_all(folder.path().join("empty")).unwrap();
+    looks(&mut open(&at("another"), &kept, true).unwrap());
+}
