@@ -3,7 +3,7 @@
 //! Objects are listed first and the catalog is read afterwards, so that a running ingest disturbs
 //! nothing: what it enters meanwhile is named by then, and what it is about to enter is young.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::BuildHasher as _;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -14,11 +14,14 @@ use saccade_core::volume::Dtype;
 
 use crate::VisualizationArchive;
 use crate::acquisition::Cursor;
-use crate::catalog::{CatalogError, History, Naming, Placing, Tile, TileId, VolumeEntry, place};
+use crate::catalog::{
+    CatalogError, History, Naming, Placing, SpoiltTile, Tile, TileId, VolumeEntry, place,
+};
 use crate::pyramid::{self, PyramidError, Verified};
 use crate::randomness::Keyed;
 use crate::storage::{Entry, StorageError};
 
+mod ahead;
 mod called;
 mod cursor;
 mod described;
@@ -190,6 +193,9 @@ pub async fn check(
     Ok(report)
 }
 
+/// A row, with what was seen of its pyramid: what it is, and how many bytes were read.
+type Looked = Result<(Tile, Result<(Verified, u64), PyramidError>), SpoiltTile>;
+
 struct Check<'a> {
     archive: &'a VisualizationArchive,
     options: &'a CheckOptions,
@@ -257,21 +263,12 @@ impl Check<'_> {
         self.read_up_to(entry).await?;
         self.read_records(entry).await;
         self.described(entry);
+        self.ahead(entry).await?;
         // Not those that are counted: what the counts leave out would be called nobody's.
         let sections = catalog.sections_of_tiles(&volume.name).await?;
         for &z in &sections {
             self.placings = None;
-            let tiles = catalog.section_rows(&volume.name, z).await?;
-            let looks = tiles.into_iter().map(async |tile| match tile {
-                Ok(tile) => {
-                    let looked = self.look(&tile).await;
-                    Ok((tile, looked))
-                }
-                Err(spoilt) => Err(spoilt),
-            });
-            let workers = self.options.workers.max(1);
-            let looks: Vec<_> = stream::iter(looks).buffered(workers).collect().await;
-            for tile in looks {
+            for tile in self.section(&volume.name, z).await? {
                 self.report.tiles += 1;
                 match tile {
                     Ok((tile, looked)) => self.tile(entry, &tile, looked).await?,
@@ -292,16 +289,15 @@ impl Check<'_> {
         let tiles = self.report.tiles - before;
         // Others may have entered some meanwhile: only what cannot be so is wrong.
         let now = catalog.entry(&volume.name).await?;
-        let counted = catalog.sections(&volume.name).await?;
-        let still = catalog.sections_of_tiles(&volume.name).await?;
-        let is_lacking =
-            |z: &&u32| still.binary_search(z).is_ok() && counted.binary_search(z).is_err();
         // Those that the volume does not have are told with their tiles.
         let depth = entry.volume.extent().z;
-        let lacking = sections.iter().filter(|z| **z < depth);
-        let lacking: Vec<u32> = lacking.filter(is_lacking).copied().collect();
+        let lacking = catalog.uncounted_sections(&volume.name).await?;
+        let lacking: Vec<u32> = lacking.into_iter().filter(|z| *z < depth).collect();
         let lacks = lacking.len();
         let all = (entry.tiles.min(now.tiles)..=entry.tiles.max(now.tiles)).contains(&tiles);
+        // One that went to another section meanwhile was met there as well, or not at all.
+        let has_changed = now.revision != entry.revision;
+        let all = all || (has_changed && catalog.is_counted(&volume.name).await?);
         if !all || lacks > 0 {
             let mut reason = format!(
                 "the catalog counts {} tiles, but has {tiles}; of {} sections with tiles it lacks {lacks}",
@@ -324,6 +320,60 @@ impl Check<'_> {
             }
         }
         Ok(())
+    }
+
+    /// The rows of a section, with what was seen of their pyramids. Those that change meanwhile are looked at once more, for what was
+    /// seen says nothing of what is there now.
+    async fn section(&mut self, volume: &str, z: u32) -> Result<Vec<Looked>, CheckError> {
+        /// Who is imaged anew without end is not waited for.
+        const TURNS: u32 = 4;
+        let catalog = self.archive.catalog();
+        let workers = self.options.workers.max(1);
+        let mut rows = catalog.section_rows(volume, z).await?;
+        let mut all = Vec::new();
+        for _ in 0..TURNS {
+            let looks = rows.into_iter().map(async |row| match row {
+                Ok(tile) => {
+                    let looked = self.look(&tile).await;
+                    Ok((tile, looked))
+                }
+                Err(spoilt) => Err(spoilt),
+            });
+            let looks: Vec<Looked> = stream::iter(looks).buffered(workers).collect().await;
+            let now = catalog.section_rows(volume, z).await?.into_iter();
+            let id_of = |row: &Result<Tile, SpoiltTile>| match row {
+                Ok(tile) => tile.id,
+                Err(spoilt) => spoilt.id,
+            };
+            let mut now: BTreeMap<_, _> = now.map(|row| (id_of(&row), row)).collect();
+            for look in looks {
+                let id = match &look {
+                    Ok((tile, _)) => tile.id,
+                    Err(spoilt) => spoilt.id,
+                };
+                let is_so = match (&look, now.get(&id)) {
+                    (Ok((before, _)), Some(Ok(now))) => before == now,
+                    (Err(_), Some(Err(_))) => true,
+                    _ => false,
+                };
+                if is_so {
+                    now.remove(&id);
+                    all.push(look);
+                }
+            }
+            rows = now.into_values().collect();
+            if rows.is_empty() {
+                break;
+            }
+        }
+        for tile in rows.into_iter().flatten() {
+            self.report.tiles += 1;
+            self.named.insert(self.hasher.hash_one(&tile.pyramid));
+            if let Some(records) = &mut self.records {
+                records.meet(&tile.name);
+            }
+        }
+        Ok(all)
     }
 
     /// A pyramid is on the list of those that are to be deleted; somebody may have taken it there since its tile was looked at.

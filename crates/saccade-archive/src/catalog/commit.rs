@@ -274,24 +274,26 @@ impl<'c> Commit<'c> {
         })
     }
 
-    /// Takes a pyramid that is another's from a tile: until its record is done anew, it has one that is not there.
+    /// Takes a pyramid that is another's from a tile, if it names that one still: until its record is done anew, it has one that is not
+    /// there. Whether it did.
     ///
     /// # Errors
     ///
     /// What the database says.
-    pub async fn detach(&mut self, tile: &str) -> Result<(), CatalogError> {
-        let Some(existing) = self.existing(tile).await?.filter(|e| !e.deleted) else {
-            return Ok(());
+    pub async fn detach(&mut self, tile: &str, pyramid: &str) -> Result<bool, CatalogError> {
+        let existing = self.existing(tile).await?.filter(|e| !e.deleted);
+        let Some(existing) = existing.filter(|e| e.pyramid.as_deref() == Some(pyramid)) else {
+            return Ok(false);
         };
         let (id, place) = (existing.id, existing.place);
         self.log_change(id, place, place, ChangeReason::Tile)
             .await?;
         // No record's, for those end with a position; and no other tile's.
-        let none = format!("{}-none{}", existing.pyramid.unwrap_or_default(), id.0);
+        let none = format!("{pyramid}-none{}", id.0);
         let update = "UPDATE tiles SET pyramid = $2, revision = $3 WHERE id = $1";
         let values = [id.0.into(), (&none).into(), self.revision.into()];
         self.run(update, &values).await?;
-        Ok(())
+        Ok(true)
     }
 
     /// Ends a row whose tile has no name by which a record could speak of it.

@@ -55,6 +55,23 @@ pub struct Holder {
     pub deleted: bool,
 }
 
+/// A row that has the position of a record that was not read yet: what the records before that say of its tile is not followed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ahead {
+    /// The tile whose row it is.
+    pub id: TileId,
+    /// What can be read of its name.
+    pub tile: String,
+    /// Position of the record that brought its image, or of its end.
+    pub position: u64,
+    /// Position of the record that brought its transform.
+    pub transform_position: u64,
+    /// Whether it is called deleted.
+    pub deleted: bool,
+    /// How far the records were read [bytes].
+    pub read: u64,
+}
+
 /// Asks for [`Placing`]s of a volume's rows.
 macro_rules! placings {
     ($which:literal) => {
@@ -145,6 +162,40 @@ impl Catalog {
         };
         let values = [id.into(), tile.into()];
         Ok(self.ask(question, &values, holder).await?.pop())
+    }
+
+    /// The rows whose tiles lie where a record says that was not read yet, and those of tiles that one has deleted; without what cannot
+    /// be understood. Looks at all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn ahead(&self, volume: &str) -> Result<Vec<Ahead>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT t.id AS id, t.name AS name, t.position AS position, \
+                        t.transform_position AS transform_position, t.deleted AS deleted, c.byte AS byte \
+                        FROM tiles AS t JOIN cursors AS c ON c.volume = t.volume WHERE t.volume = $1 \
+                        AND ((t.deleted = 0 AND t.transform_position >= c.byte) \
+                        OR (t.deleted <> 0 AND t.position >= c.byte)) ORDER BY t.id";
+        let ahead = |row: &Row| {
+            let said = |column| rows::unsigned(row, column);
+            let known = said("position")
+                .and_then(|position| Ok((position, said("transform_position")?, said("byte")?)));
+            let (id, deleted) = (TileId(row.get("id")?), row.get::<i64>("deleted")? != 0);
+            let tile = rows::legible(row, "name");
+            Ok(known
+                .ok()
+                .map(|(position, transform_position, read)| Ahead {
+                    id,
+                    tile,
+                    position,
+                    transform_position,
+                    deleted,
+                    read,
+                }))
+        };
+        let rows = self.ask(question, &[id.into()], ahead).await?;
+        Ok(rows.into_iter().flatten().collect())
     }
 
     /// What brought the tiles of a section to where they lie; those of which it cannot be understood are left out.

@@ -163,6 +163,35 @@ impl Catalog {
         self.ask(question, &[id.into()], rows::section).await
     }
 
+    /// The sections that have tiles and are not counted among those, ascending. Looks at all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::sections`].
+    pub async fn uncounted_sections(&self, volume: &str) -> Result<Vec<u32>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT DISTINCT section FROM tiles AS t WHERE volume = $1 AND deleted = 0 \
+                        AND section BETWEEN 0 AND 4294967295 AND NOT EXISTS \
+                        (SELECT 1 FROM sections AS s WHERE s.volume = t.volume AND s.section = t.section) \
+                        ORDER BY section";
+        self.ask(question, &[id.into()], rows::section).await
+    }
+
+    /// Whether as many tiles are there as are counted, at one moment. Looks at all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::sections`].
+    pub async fn is_counted(&self, volume: &str) -> Result<bool, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT v.tiles AS counted, \
+                        (SELECT count(*) FROM tiles AS t WHERE t.volume = v.id AND t.deleted = 0) AS there \
+                        FROM volumes AS v WHERE v.id = $1";
+        let is_so = |row: &Row| Ok(row.get::<i64>("counted")? == row.get::<i64>("there")?);
+        let found = self.ask(question, &[id.into()], is_so).await?;
+        Ok(found.into_iter().all(|is_so| is_so))
+    }
+
     /// Counts. Cheap at any number of tiles.
     ///
     /// # Errors

@@ -32,12 +32,11 @@ impl Check<'_> {
             return Ok(Some(self.got_its_name(entry, listed, tile)));
         }
         let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
-        let row = catalog.origin(volume, tile.id).await?;
         // Another may have read on meanwhile.
-        let Some(row) = row.filter(|row| row.position < read.offset) else {
+        if tile.position >= read.offset {
             return Ok(Some(tile));
-        };
-        let by_row = self.recorded(entry, row.position);
+        }
+        let by_row = self.recorded(entry, tile.position);
         let by_pyramid = Name::of(&tile.pyramid)
             .filter(|name| name.volume == *volume && name.position < read.offset)
             .and_then(|name| {
@@ -54,7 +53,9 @@ impl Check<'_> {
                 let is_there =
                     holder.is_some_and(|row| self.is_right(entry, row, &tile, &of, is_known));
                 match (is_known, is_there) {
-                    (true, true) => return Ok(Some(tile)),
+                    (true, true) => {
+                        return self.called_as_row(entry, listed, tile, by_row, &of).await;
+                    }
                     (true, false) if !is_sure && holder.is_none() => return Ok(Some(tile)),
                     (false, true) => self.is_there_as_well(entry, listed, &tile, &of).await?,
                     (_, false) => {
@@ -70,6 +71,32 @@ impl Check<'_> {
                 Ok(None)
             }
         }
+    }
+
+    /// A tile that names the pyramid of one that is there: if its row has the number of a record of neither, and the row that has the
+    /// name of that one is not that one's, it is that one.
+    async fn called_as_row<'t>(
+        &mut self,
+        entry: &VolumeEntry,
+        listed: &'t Tile,
+        tile: Cow<'t, Tile>,
+        by_row: Option<String>,
+        by_pyramid: &str,
+    ) -> Result<Option<Cow<'t, Tile>>, CheckError> {
+        let records = self.records.as_ref();
+        let newest = |of: &str| records.and_then(|records| records.newest_of(of));
+        let by_row = by_row
+            .filter(|of| *of != tile.name && of != by_pyramid && newest(of) == Some(tile.position));
+        let Some(own) = by_row else {
+            return Ok(Some(tile));
+        };
+        let holder = { self.archive.catalog() }.holder(&entry.volume.name, &own);
+        let holder = holder.await?;
+        if holder.is_some_and(|row| self.is_right(entry, row, &tile, &own, true)) {
+            return Ok(Some(tile));
+        }
+        let named = self.call(entry, listed, &tile, &own, holder).await?;
+        Ok(Some(Cow::Owned(named)))
     }
 
     /// Whether the row that has the name `of` is that tile's, where another has its pyramid.

@@ -1,5 +1,6 @@
 //! Tiles that are said to be deleted, of which no deletion is known.
 
+use std::borrow::Cow;
 use std::hash::BuildHasher as _;
 
 use super::repair::Source;
@@ -13,6 +14,14 @@ impl Check<'_> {
     pub(super) async fn half_deleted(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
         let volume = &entry.volume.name;
         for row in self.archive.catalog().half_deleted(volume).await? {
+            let row = match row {
+                // The record that ended the tile of that name says nothing of another's row.
+                Ok(tile) if self.is_told_deleted(&tile.name) => {
+                    let called = self.rightly_called(entry, &tile).await?;
+                    Ok(called.map_or_else(|| tile.clone(), Cow::into_owned))
+                }
+                row => row,
+            };
             let (name, pyramid) = match &row {
                 Ok(tile) => (Some(&tile.name), Some(&tile.pyramid)),
                 Err(spoilt) => (spoilt.name.as_ref().ok(), spoilt.pyramid.as_ref().ok()),
@@ -21,8 +30,7 @@ impl Check<'_> {
                 self.named.insert(self.hasher.hash_one(pyramid));
             }
             let id = row.as_ref().map_or_else(|spoilt| spoilt.id, |tile| tile.id);
-            let is_told = { name.zip(self.records.as_ref()) }
-                .is_some_and(|(name, records)| records.is_deleted(name));
+            let is_told = name.is_some_and(|name| self.is_told_deleted(name));
             let is_known = !is_told && self.history.was_deleted(id, 0);
             if is_told || is_known {
                 let (tile, object) = (name.cloned(), pyramid.cloned());
@@ -60,6 +68,11 @@ impl Check<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Whether the newest of a tile's records is its end.
+    fn is_told_deleted(&self, tile: &str) -> bool {
+        { self.records.as_ref() }.is_some_and(|records| records.is_deleted(tile))
     }
 
     /// A tile of which only the place cannot be, where its newest record says that it lies.

@@ -38,11 +38,8 @@ impl Check<'_> {
             return Ok(false);
         }
         let catalog = self.archive.catalog();
-        let Some(row) = catalog.origin(volume, tile.id).await? else {
-            return Ok(false);
-        };
         // A newer image may still wait, and who gave the tile another name has kept the pyramid's.
-        let is_of_its_record = !is_elsewhere && row.position == name.position;
+        let is_of_its_record = !is_elsewhere && tile.position == name.position;
         let is_shared = catalog.origins(volume, &tile.pyramid).await?.len() > 1;
         if is_of_its_record || (is_shared && !self.renamed.contains(&tile.pyramid)) {
             return Ok(false);
@@ -52,7 +49,7 @@ impl Check<'_> {
             matches!(source, Source::There(..) | Source::ImageGone(_))
         };
         let is_older = !is_elsewhere && is_its(name.position);
-        if is_older && (!is_its(row.position) || row.position < name.position) {
+        if is_older && (!is_its(tile.position) || tile.position < name.position) {
             return Ok(false);
         }
         let reason = match () {
@@ -69,7 +66,7 @@ impl Check<'_> {
             self.rename_pyramid(kind, entry, tile, own, reason).await?;
             return Ok(true);
         }
-        self.anew(entry, tile, row, reason).await?;
+        self.anew(entry, tile, reason).await?;
         Ok(true)
     }
 
@@ -78,18 +75,23 @@ impl Check<'_> {
         &mut self,
         entry: &VolumeEntry,
         tile: &Tile,
-        row: Origin,
         mut reason: String,
     ) -> Result<(), CheckError> {
-        let position = self.position(entry, tile).await?.unwrap_or(row.position);
+        let position = self.position(entry, tile).await?.unwrap_or(tile.position);
         let known = (entry.volume.name.clone(), position);
         self.kept.insert(known);
         let source = self.source(entry, Some(&tile.name), Some(position));
         let mut repair = None;
         match source {
             Source::There(..) if self.options.repair => {
-                let origin = Origin { position, ..row };
-                repair = Some(self.give_back(entry, &origin, &reason).await?);
+                let origin = Origin {
+                    tile: tile.name.clone(),
+                    position,
+                    transform_position: position,
+                };
+                repair = self
+                    .give_back(entry, &origin, &tile.pyramid, &reason)
+                    .await?;
             }
             Source::There(..) => {}
             source => reason.push_str(&source.advice(false)),

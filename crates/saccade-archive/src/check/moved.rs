@@ -209,7 +209,7 @@ impl Check<'_> {
                 };
                 let there = place(entry.volume.extent(), tile.section, tile.size, to);
                 let may_have_moved = last.was_moved || !self.history.is_whole();
-                there != Some(came) || (lies == came && may_have_moved)
+                may_have_moved && (there != Some(came) || lies == came)
             }
             ChangeReason::Deleted => true,
         };

@@ -30,7 +30,9 @@ impl Check<'_> {
             };
             let mut repair = None;
             if self.options.repair {
-                repair = Some(self.give_back(entry, origin, &reason).await?);
+                repair = self
+                    .give_back(entry, origin, &tile.pyramid, &reason)
+                    .await?;
                 let given_back = (volume.clone(), origin.tile.clone());
                 self.given_back.insert(given_back);
             }
@@ -46,17 +48,20 @@ impl Check<'_> {
         Ok(())
     }
 
-    /// Takes a pyramid that is not its own from a tile, and has it made anew.
+    /// Takes a pyramid that is not its own from a tile, and has it made anew; nothing, if it names another one meanwhile.
     pub(super) async fn give_back(
         &self,
         entry: &VolumeEntry,
         origin: &Origin,
+        pyramid: &str,
         reason: &str,
-    ) -> Result<Repair, CheckError> {
+    ) -> Result<Option<Repair>, CheckError> {
         let catalog = self.archive.catalog();
         let record = self.tile_record(entry, Some(&origin.tile), origin.position);
         let mut commit = catalog.begin(&entry.volume.name).await?;
-        commit.detach(&origin.tile).await?;
+        if !commit.detach(&origin.tile, pyramid).await? {
+            return Ok(None);
+        }
         let repair = match record {
             Some(record) => {
                 let waiting = Waiting {
@@ -82,6 +87,6 @@ impl Check<'_> {
             }
         };
         commit.finish().await?;
-        Ok(repair)
+        Ok(Some(repair))
     }
 }

@@ -12,6 +12,7 @@ mod place;
 #[path = "../support/postgres.rs"]
 mod postgres;
 mod properties;
+mod rectified;
 mod server;
 mod spoilt;
 mod sqlite;
@@ -55,6 +56,10 @@ on_both! {
     suite::other_processes_commits_are_heard,
     suite::several_writers_take_turns,
     suite::other_sizes_and_unknown_names_are_refused,
+    rectified::names_go_where_they_belong_and_nobody_hears_of_it,
+    rectified::rows_are_rectified_as_they_were_found_or_not_at_all,
+    rectified::who_follows_hears_what_is_shown_again_and_taken_away,
+    rectified::who_is_ahead_of_what_was_read_is_found_and_follows_again,
     spoilt::a_spoilt_tile_is_told_and_goes_with_its_next_record,
     spoilt::where_a_tile_of_no_size_lies_is_kept_until_it_has_one,
     spoilt::a_record_that_is_done_once_more_moves_nothing_back,

@@ -6,7 +6,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::Commit;
 use crate::catalog::database::Value;
-use crate::catalog::{CatalogError, ChangeReason, Tile, TileId, place};
+use crate::catalog::{Ahead, CatalogError, ChangeReason, Tile, TileId, place};
 
 impl Commit<'_> {
     /// Has a tile name another pyramid, if it is still as it was found. The one that it named is not retired: it is another's.
@@ -73,6 +73,36 @@ impl Commit<'_> {
             (&tile.pyramid).into(),
             position.into(),
             self.revision.into(),
+        ];
+        self.run(update, &values).await?;
+        Ok(())
+    }
+
+    /// Has what records say of a tile from a position on be followed, if its row still has the position of one that was not read. No voxel
+    /// changes.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn follow_from(&mut self, row: &Ahead, position: u64) -> Result<(), CatalogError> {
+        let update = match row.deleted {
+            false => {
+                "UPDATE tiles SET transform_position = $4 \
+                 WHERE id = $1 AND volume = $2 AND transform_position = $3 AND deleted = 0"
+            }
+            true => {
+                "UPDATE tiles SET position = $4 WHERE id = $1 AND volume = $2 AND position = $3 AND deleted <> 0"
+            }
+        };
+        let found = match row.deleted {
+            false => row.transform_position,
+            true => row.position,
+        };
+        let values = [
+            row.id.0.into(),
+            self.volume.into(),
+            found.into(),
+            position.into(),
         ];
         self.run(update, &values).await?;
         Ok(())

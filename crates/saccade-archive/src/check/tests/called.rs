@@ -1,10 +1,13 @@
 //! Rows that have another tile's name, or that of none.
 
+use std::time::SystemTime;
+
 use saccade_core::voxel_box::VoxelBox;
 
-use super::audit::{at, repairs};
+use super::audit::{at, move_it, repairs};
 use super::*;
 use crate::acquisition::DeleteRecord;
+use crate::catalog::TileOutcome;
 
 const NAMED: (FindingKind, Option<Repair>) = (FindingKind::Spoilt, Some(Repair::Renamed));
 
@@ -200,6 +203,139 @@ async fn a_tile_that_is_there_is_not_taken_for_one_too_many() {
             assert_eq!(fixture.look(false).await.findings, []);
         }
     }
+}
+
+/// A row that is called deleted by hand, and after one that a record has deleted, is its own pyramid's.
+#[tokio::test]
+async fn a_tile_that_is_called_as_one_that_is_deleted_is_not_ended() {
+    for half in ["deleted = 1", "deleted = 1, tx = tx + 17"] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        let gone = DeleteRecord { tile: "t5".into() };
+        let position = fixture.append(&Record::Delete(gone)).await;
+        catalog.delete_tile(VOLUME, "t5", position).await.unwrap();
+        let (before, held) = (fixture.shown().await, catalog.holder(VOLUME, "t5").await);
+        let row = format!("UPDATE tiles SET {half} WHERE name = 't2'");
+        fixture.meddle(&[&row]).await;
+        fixture.call(&[("t2", "t5"), ("t5", "t2")]).await;
+        assert!(fixture.look(false).await.damage() > 0);
+        let report = fixture.look(true).await;
+        assert!(repairs(&report).contains(&NAMED), "{:?}", report.findings);
+        assert!(
+            fixture.shown().await == before,
+            "{half}: {:?}",
+            report.findings
+        );
+        let now = catalog.holder(VOLUME, "t5").await.unwrap();
+        assert_eq!(now, held.unwrap());
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+    // One that only kept its pyramid when it was deleted is ended.
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    let gone = DeleteRecord { tile: "t5".into() };
+    let position = fixture.append(&Record::Delete(gone)).await;
+    catalog.delete_tile(VOLUME, "t5", position).await.unwrap();
+    let before = fixture.shown().await;
+    let names = format!(
+        "UPDATE tiles SET pyramid = '{}' WHERE name = 't5'",
+        fixture.names[5]
+    );
+    fixture.meddle(&[&names]).await;
+    fixture.look(true).await;
+    assert!(fixture.shown().await == before);
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+/// Two tiles have each other's names, pyramids and numbers: so each lies where the other did, and nothing ever moved.
+#[tokio::test]
+async fn places_that_were_exchanged_are_nobodys_moves() {
+    for was_moved in [false, true] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        fixture.image_again("t4", at(300.0)).await;
+        if was_moved {
+            catalog.set_transform(VOLUME, "t5", at(90.0)).await.unwrap();
+        }
+        let before = fixture.shown().await;
+        let mut exchange = Vec::new();
+        for (of, to) in [("t4", "t5"), ("t5", "t4")] {
+            let its = catalog.tile(VOLUME, of).await.unwrap().unwrap();
+            exchange.push(format!(
+                "UPDATE tiles SET width = {}, pyramid = '{}', position = {at}, transform_position = {at} WHERE name = '{to}'",
+                its.size.x,
+                its.pyramid,
+                at = its.position
+            ));
+        }
+        let exchange: Vec<_> = exchange.iter().map(String::as_str).collect();
+        fixture.meddle(&exchange).await;
+        fixture.call(&[("t4", "t5"), ("t5", "t4")]).await;
+        let report = fixture.look(false).await;
+        assert!(report.damage() > 0, "{was_moved}");
+        let report = fixture.look(true).await;
+        assert!(
+            report
+                .findings
+                .iter()
+                .all(|f| f.repair == Some(Repair::Moved))
+        );
+        // Where one was moved to, nobody knows any more.
+        let recorded = { fixture.shown().await.into_iter() }.zip(before);
+        let is_back = |(now, before): (_, _)| now == before;
+        assert!(recorded.filter(|_| !was_moved).all(is_back));
+        assert_eq!(fixture.look(false).await.findings, []);
+    }
+}
+
+/// Rows that are ahead of what was read follow what is recorded next.
+#[tokio::test]
+async fn what_is_recorded_next_is_followed() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture.delete("t5").await;
+    let gone = DeleteRecord { tile: "t3".into() };
+    let end = fixture.append(&Record::Delete(gone)).await;
+    catalog.delete_tile(VOLUME, "t3", end).await.unwrap();
+    let ahead = [
+        "UPDATE tiles SET transform_position = transform_position + 100000 WHERE name IN ('t2', 't3')",
+        "UPDATE tiles SET position = position + 100000 WHERE name IN ('t3', 't5')",
+    ];
+    fixture.meddle(&ahead).await;
+    let told = { ["t2", "t3", "t5"] }.map(|tile| (FindingKind::Spoilt, tile));
+    let without = fixture.check(false).await;
+    assert_eq!(without.findings, []);
+    assert_eq!(found(&fixture.look(false).await), told);
+    let mended = [(FindingKind::Spoilt, Some(Repair::Renumbered)); 3];
+    assert_eq!(repairs(&fixture.look(true).await), mended);
+    assert_eq!(fixture.look(false).await.findings, []);
+    let held = catalog.holder(VOLUME, "t3").await.unwrap().unwrap();
+    assert_eq!(held.position, Some(end));
+
+    let position = fixture.append(&move_it("t2", at(44.0))).await;
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit
+        .transform("t2", at(44.0), Some(position))
+        .await
+        .unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(fixture.transform("t2").await, at(44.0));
+    // What was said before is not followed now.
+    let old = NewTile {
+        position: 1,
+        ..fixture.image_again("t2", at(50.0)).await
+    };
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    let outcome = commit
+        .tile(
+            &NewTile {
+                name: "t5".into(),
+                ..old
+            },
+            SystemTime::now(),
+        )
+        .await;
+    assert_eq!(outcome.unwrap(), TileOutcome::Superseded);
 }
 
 /// Of two that are deleted no voxel tells, but what is recorded of them later.

@@ -7,21 +7,15 @@ use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Volume;
 use sqlx::{ConnectOptions as _, Connection as _};
 
+use super::audit::move_it;
 use super::*;
-use crate::acquisition::{AcquisitionInfo, TransformRecord};
+use crate::acquisition::AcquisitionInfo;
 
 #[tokio::test]
 async fn tiles_outside_of_the_volume_are_moved_to_where_their_records_say() {
     let fixture = Fixture::new().await;
     let moved = SectionFromTile::translation(DVec2::new(40.0, 7.0));
-    let list = fixture.acquisition.path().join(RecordReader::FILE);
-    let position = fs::metadata(list).unwrap().len();
-    let mut writer = RecordWriter::open(fixture.acquisition.path()).unwrap();
-    let record = TransformRecord {
-        tile: "t2".to_owned(),
-        transform: moved,
-    };
-    writer.append(&Record::Transform(record)).unwrap();
+    let position = fixture.append(&move_it("t2", moved)).await;
     let catalog = fixture.archive.catalog();
     let mut commit = catalog.begin(VOLUME).await.unwrap();
     commit.transform("t2", moved, Some(position)).await.unwrap();
