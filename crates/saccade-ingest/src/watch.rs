@@ -122,11 +122,12 @@ pub enum WatchError {
         /// What is kept.
         path: PathBuf,
     },
-    /// The folder that was watched is gone, and this one, elsewhere, is another.
+    /// The folder that was watched is gone, and this one, elsewhere, does not look like it.
     #[error(
-        "the folder that is followed under this name, {}, is not there any more, and this one is another: of {compared} images that \
-         both have, none has the size and time that it had. Take it in under another name (`saccade ingest --volume NAME`) or into another \
-         archive; if it is that folder, and its files got other times as it was copied, say --moved: {}",
+        "the folder that is followed under this name, {}, is not there any more, and this one does not look like it: of {looked_for} images \
+         that were taken in there {found} are here, {same} of them with the size and time that they had. Take it in under another name \
+         (`saccade ingest --volume NAME`) or into another archive; if it is that folder, wait until it is copied, or, if its files got other \
+         times, say --moved: {}",
         was.display(),
         folder.display()
     )]
@@ -135,8 +136,24 @@ pub enum WatchError {
         was: PathBuf,
         /// This one.
         folder: PathBuf,
-        /// Images that were compared.
-        compared: usize,
+        /// Images that were told of.
+        looked_for: usize,
+        /// Those of them that are in this one.
+        found: usize,
+        /// Those of them that look as they did.
+        same: usize,
+    },
+    /// The folder that was watched is gone, and another process waits for it.
+    #[error(
+        "another process follows {} under this name, and waits for it to be there again: end that one first, if the folder has moved here: {}",
+        was.display(),
+        folder.display()
+    )]
+    Led {
+        /// Where the folder was.
+        was: PathBuf,
+        /// This one.
+        folder: PathBuf,
     },
 }
 
@@ -207,6 +224,15 @@ pub(crate) const BEFORE_FIRST: u32 = u32::MAX;
 /// Name of the link to the watched folder.
 const LINK: &str = "files";
 
+/// What is said where the folder that is watched is still there, and another is to be.
+fn another(there: &Path, folder: &Path) -> String {
+    let there = format!(
+        "{}, which still exists (if what is followed has moved, rename or unmount that first),",
+        there.display()
+    );
+    difference("folder", &there, &folder.to_string_lossy())
+}
+
 /// Makes the link to the folder that is watched; whether it led elsewhere. Of several that do so at once all succeed.
 fn link(folder: &Path, kept: &Path) -> Result<bool, WatchError> {
     let link = kept.join(LINK);
@@ -272,7 +298,6 @@ impl<F: Folders> Watch<F> {
         };
         let folder = folder.canonicalize().map_err(look)?;
         let info = AcquisitionInfo::read(kept).ok();
-        let linked = fs::read_link(kept.join(LINK)).ok();
         let pitch = config.pitch.to_array();
         let pattern = config.pattern.to_string();
         let now = Settings::of_watch(&pattern, pitch, config.scale, config.first);
@@ -281,11 +306,7 @@ impl<F: Folders> Watch<F> {
         if let Some(info) = &info {
             differences.extend(volume_differences(info, &config.info));
         }
-        // One that is gone from where it was has moved here.
-        if let Some(there) = linked.as_ref().filter(|to| **to != folder && to.exists()) {
-            let (there, now) = (there.to_string_lossy(), folder.to_string_lossy());
-            differences.push(difference("folder", &there, &now));
-        }
+        differences.extend(moved::still_there(&folder, kept).map(|there| another(&there, &folder)));
         if let Some(there) = &settings {
             differences.extend(now.differences(there));
         }

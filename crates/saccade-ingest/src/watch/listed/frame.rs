@@ -12,7 +12,7 @@ use saccade_archive::image::{read_bits, read_size};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::{Dtype, MAX_EXTENT};
 
-use super::super::{LINK, SETTINGS, WatchError, is_unused};
+use super::super::{SETTINGS, WatchError, another, is_unused, moved};
 use super::counted::Counted;
 use super::index::{Index, Sought, base};
 use super::source::{Adopted, Listing, adopt, line_of, raw};
@@ -20,7 +20,7 @@ use super::{ListConfig, ListError, MOST_ASKED};
 use crate::replay::ReplayError;
 use crate::replay::acquisition::spanned;
 use crate::replay::lists::Solution;
-use crate::simulate::settings::{Settings, difference, volume_differences};
+use crate::simulate::settings::{Settings, volume_differences};
 
 /// Name of the file that says which solution is used.
 const SOLUTION: &str = "solution.json";
@@ -79,12 +79,7 @@ impl Frame {
         if let Some((there, now)) = info.as_ref().zip(now.as_ref()) {
             differences.extend(volume_differences(there, now));
         }
-        // One that is gone from where it was has moved here.
-        let linked = fs::read_link(kept.join(LINK)).ok();
-        if let Some(there) = linked.filter(|to| to != folder && to.exists()) {
-            let (there, now) = (there.to_string_lossy(), folder.to_string_lossy());
-            differences.push(difference("folder", &there, &now));
-        }
+        differences.extend(moved::still_there(folder, kept).map(|there| another(&there, folder)));
         let frame = settings.as_ref().zip(info).map(|(there, info)| {
             let origin = there.pair("origin").map(DVec2::from_array);
             Self {

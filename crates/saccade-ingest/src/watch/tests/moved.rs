@@ -68,6 +68,7 @@ fn a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not() {
     let said = refused.to_string();
     for word in [
         "of 3 images",
+        "3 are here, 0 of them",
         "away/scan",
         "another/scan",
         "--volume",
@@ -75,12 +76,54 @@ fn a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not() {
     ] {
         assert!(said.contains(word), "{said}");
     }
-    // Refused, it is not followed, however often it is tried.
+    // Refused, it is not followed, however often it is tried; nor is one in which nothing is yet.
     assert!(open(&at("another"), &kept, false).is_err());
-    assert_eq!(told(&kept).len(), 5);
-    // Where nothing is there yet, nothing tells.
     fs::create_dir_all(at("empty")).unwrap();
-    open(&at("empty"), &kept, false).unwrap();
-    fs::remove_dir_all(folder.path().join("empty")).unwrap();
+    let refused = open(&at("empty"), &kept, false).err().unwrap();
+    assert!(matches!(refused, WatchError::Another { found: 0, .. }));
+    assert_eq!(told(&kept).len(), 5);
+    // One image of it, such as a blank one, does not make another the same.
+    set_age(&at("another").join(FILES[0]), 500);
+    let refused = open(&at("another"), &kept, false).err().unwrap();
+    assert!(matches!(refused, WatchError::Another { same: 1, .. }));
     looks(&mut open(&at("another"), &kept, true).unwrap());
+}
+
+/// Renamed with its folder, a file is what it was, and one that took another's place is not, though it has its size and time.
+#[test]
+fn what_was_replaced_before_a_folder_moved_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    fill(&at("first"), 500);
+    looks(&mut open(&at("first"), &at("kept"), false).unwrap());
+    image(&at("first").join(FILES[1]), 40, 77);
+    set_age(&at("first").join(FILES[1]), 500);
+    fs::rename(at("first"), at("second")).unwrap();
+    looks(&mut open(&at("second"), &at("kept"), false).unwrap());
+    let tiles = told(&at("kept"));
+    assert_eq!(tiles.len(), 4);
+    assert!(tiles[3].file.ends_with(FILES[1]));
+    // What is left in the old place leads to it.
+    fs::rename(at("second"), at("third")).unwrap();
+    std::os::unix::fs::symlink(at("third"), at("second")).unwrap();
+    for place in ["second", "third"] {
+        looks(&mut open(&at(place), &at("kept"), false).unwrap());
+        assert_eq!(told(&at("kept")).len(), 4);
+    }
+}
+
+/// Who waits for a folder to come back would not see what is in the place to which it has moved.
+#[test]
+fn two_places_are_not_followed_as_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    fill(&at("first"), 500);
+    let mut first = open(&at("first"), &at("kept"), false).unwrap();
+    looks(&mut first);
+    fs::rename(at("first"), at("second")).unwrap();
+    let refused = open(&at("second"), &at("kept"), false).err().unwrap();
+    assert!(matches!(refused, WatchError::Led { .. }), "{refused}");
+    assert!(refused.to_string().contains("end that one first"));
+    drop(first);
+    open(&at("second"), &at("kept"), false).unwrap();
 }

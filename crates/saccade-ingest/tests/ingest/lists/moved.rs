@@ -51,7 +51,11 @@ async fn the_images_of_a_folder_that_moved_are_known_and_those_of_another_refuse
         assert!(
             matches!(
                 refused,
-                ListError::Watch(WatchError::Another { compared: 2, .. })
+                ListError::Watch(WatchError::Another {
+                    found: 2,
+                    same: 0,
+                    ..
+                })
             ),
             "{refused}"
         );
