@@ -24,7 +24,7 @@ mod sort;
 
 pub use location::{BucketLocation, BucketLocationError};
 use parts::Uploads;
-use sort::{is_transport, knows_no_conditions, missing_object, sorted};
+use sort::{is_broken_off, is_transport, knows_no_conditions, missing_object, sorted};
 
 /// Requests under way at once; more wait here rather than in the store.
 const REQUESTS: usize = 64;
@@ -219,6 +219,8 @@ impl ObjectStorage {
         let error = loop {
             let answer = match self.store.get_opts(&path, options.clone()).await {
                 Ok(answer) => answer,
+                // Why it is refused broke off, and the client does not ask again.
+                Err(e) if is_broken_off(&e) && turns.next().is_some() => continue,
                 Err(e) => break self.failed(e, name),
             };
             match answer.bytes().await {

@@ -111,3 +111,8 @@ pub(super) fn sorted(error: Error, path: &str) -> StorageError {
 pub(super) fn is_transport(error: &Error) -> bool {
     chain(error).any(|e| e.is::<object_store::client::HttpError>())
 }
+
+/// Whether an answer began to come, and not all of it came.
+pub(super) fn is_broken_off(error: &Error) -> bool {
+    is_transport(error) && says(error, "response body")
+}

@@ -79,6 +79,8 @@ const BUSY: &str = "HTTP/1.1 503 Slow Down\r\ncontent-length: 0\r\nconnection: c
 const MANY: &str =
     "HTTP/1.1 429 Too Many Requests\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
 const NO_KEY: &str = "HTTP/1.1 404 Not Found\r\ncontent-length: 35\r\nconnection: close\r\n\r\n<Error><Code>NoSuchKey</Code></Error>";
+const BROKEN_NO_KEY: &str =
+    "HTTP/1.1 404 Not Found\r\ncontent-length: 35\r\nconnection: close\r\n\r\n<Error><Code>NoS";
 const NO_BUCKET: &str = "HTTP/1.1 404 Not Found\r\ncontent-length: 38\r\nconnection: close\r\n\r\n<Error><Code>NoSuchBucket</Code></Error>";
 const ELSEWHERE: &str = "HTTP/1.1 301 Moved\r\ncontent-length: 0\r\nconnection: close\r\n\r\n";
 const FULL: &str =
@@ -159,6 +161,27 @@ async fn what_passes_is_asked_again() {
         .await
         .unwrap();
     assert_eq!(asked.load(Ordering::SeqCst), 3);
+}
+
+/// Why an object is not read may break off as well as the object.
+#[tokio::test]
+async fn refusals_that_break_off_are_asked_for_again() {
+    let (url, asked) = server(vec![BUSY, BROKEN_NO_KEY, BROKEN_NO_KEY, NO_KEY]).await;
+    let read = storage(&url, &[]).read("a", None).await;
+    assert!(
+        matches!(read, Err(StorageError::NotFound { .. })),
+        "{read:?}"
+    );
+    assert_eq!(asked.load(Ordering::SeqCst), 4);
+    let (url, asked) = server(vec![BROKEN_NO_KEY]).await;
+    let error = storage(&url, &[]).read("a", None).await.unwrap_err();
+    assert!(error.is_outage(), "{error:?}");
+    assert_eq!(asked.load(Ordering::SeqCst), 4, "no more often than others");
+    // Nobody answers at all: the client has asked often enough.
+    let (url, asked) = server(vec![""]).await;
+    let error = storage(&url, &[]).read("a", None).await.unwrap_err();
+    assert!(error.is_outage(), "{error:?}");
+    assert_eq!(asked.load(Ordering::SeqCst), 4, "by the client alone");
 }
 
 /// What has taken the place of what was being read is read from its beginning.
