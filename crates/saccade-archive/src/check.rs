@@ -366,7 +366,14 @@ impl Check<'_> {
                 break;
             }
         }
-        for tile in rows.into_iter().flatten() {
+        for row in rows {
+            let tile = match row {
+                Ok(tile) => tile,
+                Err(spoilt) => {
+                    all.push(Err(spoilt));
+                    continue;
+                }
+            };
             self.report.tiles += 1;
             self.named.insert(self.hasher.hash_one(&tile.pyramid));
             if let Some(records) = &mut self.records {

@@ -1,5 +1,6 @@
 //! Rows that have another tile's name, or that of none.
 
+use std::collections::BTreeMap;
 use std::time::SystemTime;
 
 use saccade_core::voxel_box::VoxelBox;
@@ -7,7 +8,7 @@ use saccade_core::voxel_box::VoxelBox;
 use super::audit::{at, move_it, repairs};
 use super::*;
 use crate::acquisition::DeleteRecord;
-use crate::catalog::TileOutcome;
+use crate::catalog::{TileId, TileOutcome};
 
 const NAMED: (FindingKind, Option<Repair>) = (FindingKind::Spoilt, Some(Repair::Renamed));
 
@@ -23,6 +24,17 @@ impl Fixture {
         }
         shown.sort_by(|a, b| a.0.cmp(&b.0));
         shown
+    }
+
+    /// What each row is called.
+    async fn called(&self) -> BTreeMap<TileId, String> {
+        let catalog = self.archive.catalog();
+        let mut called = BTreeMap::new();
+        for z in catalog.sections_of_tiles(VOLUME).await.unwrap() {
+            let tiles = catalog.section_tiles(VOLUME, z).await.unwrap();
+            called.extend(tiles.into_iter().map(|tile| (tile.id, tile.name)));
+        }
+        called
     }
 
     /// Gives rows each other's names.
@@ -447,4 +459,31 @@ async fn a_tile_whose_newer_image_waits_keeps_its_name() {
     let renamed = |f: &&Finding| f.repair == Some(Repair::Renamed);
     assert_eq!(report.findings.iter().find(renamed), None);
     assert!(fixture.shown().await == before);
+}
+
+/// Where its row names the pyramid of another as well, the number of its record is what is left of it.
+#[tokio::test]
+async fn a_name_goes_back_by_the_number_of_its_record_alone() {
+    for are_exchanged in [true, false] {
+        let fixture = Fixture::new().await;
+        let before = fixture.called().await;
+        let mut wrong = (FindingKind::Shared, "t1");
+        if are_exchanged {
+            fixture.call(&[("t1", "t2"), ("t2", "t1")]).await;
+            wrong = (FindingKind::Spoilt, "t2");
+        }
+        let of_another = &fixture.names[3];
+        let pyramid = format!(
+            "UPDATE tiles SET pyramid = '{of_another}' WHERE name = '{}'",
+            wrong.1
+        );
+        fixture.meddle(&[&pyramid]).await;
+        let spoilt = fixture.called().await;
+        assert_eq!(spoilt != before, are_exchanged);
+        let told = fixture.look(false).await;
+        assert!(found(&told).contains(&wrong), "{:?}", told.findings);
+        assert!(fixture.called().await == spoilt);
+        fixture.look(true).await;
+        assert!(fixture.called().await == before, "{are_exchanged}");
+    }
 }
