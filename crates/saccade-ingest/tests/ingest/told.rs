@@ -7,7 +7,7 @@ use saccade_archive::VisualizationArchive;
 use saccade_ingest::Cancel;
 use saccade_ingest::ingest::{IngestOptions, run};
 
-use crate::scope::{Scope, VOLUME, archive, quick, seen, tile_record};
+use crate::scope::{Diary, Scope, VOLUME, archive, quick, seen, tile_record};
 
 const SIZE: UVec2 = UVec2::new(37, 29);
 
@@ -83,5 +83,41 @@ async fn reasons_do_not_say_where_on_this_machine_things_lie() {
     assert!(
         reason.contains("the acquisition's folder/tiles/gone.tif") && !reason.contains(machine),
         "{reason}"
+    );
+}
+
+/// Names that start anew in each section leave the last one's tiles; who writes them so hears of it, once.
+#[tokio::test]
+async fn a_name_that_another_section_takes_is_told_once() {
+    let (scope, folder) = (Scope::new(), tempfile::tempdir().unwrap());
+    let archive = archive(folder.path()).await;
+    for name in ["a", "b"] {
+        scope.tile(name, 3, SIZE, 1);
+    }
+    let diary = Diary::default();
+    let work = async || run(scope.path(), &archive, &quick(), &diary, &Cancel::new()).await;
+    // An image that is taken again where it was is none.
+    scope.tile("a", 3, SIZE, 2);
+    assert_eq!(work().await.unwrap().elsewhere, 0);
+    let told = |diary: &Diary| {
+        diary
+            .notices()
+            .into_iter()
+            .filter(|n| n.contains("in section 3"))
+    };
+    assert_eq!(told(&diary).count(), 0);
+    for name in ["a", "b"] {
+        scope.tile(name, 4, SIZE, 3);
+    }
+    assert_eq!(work().await.unwrap().elsewhere, 2);
+    let said: Vec<_> = told(&diary).collect();
+    assert_eq!(said.len(), 1, "{said:?}");
+    let parts = ["newest record has it in section 4", "such as \"s4_"];
+    assert!(parts.iter().all(|part| said[0].contains(part)), "{said:?}");
+    let seen = seen(&archive).await;
+    assert!(
+        seen.values().all(|tile| tile.section == 4),
+        "{:?}",
+        seen.keys()
     );
 }

@@ -19,6 +19,8 @@ use crate::scope::{
 
 const SIZE: UVec2 = UVec2::new(140, 90);
 const TILES: u64 = 60;
+/// With those that are moved.
+const RECORDS: u64 = TILES + TILES / 5;
 
 /// A stream of tiles, some imaged again, some moved.
 fn scope() -> Scope {
@@ -64,15 +66,19 @@ async fn share(url: Option<&str>) {
                 lease: Duration::from_secs(60),
                 ..quick()
             };
-            let done = run(scope.path(), &archive, &options, &(), &Cancel::new()).await;
+            let diary = Diary::default();
+            let done = run(scope.path(), &archive, &options, &diary, &Cancel::new()).await;
             archive.catalog().close().await;
-            done.unwrap()
+            (done.unwrap(), diary.states())
         }));
     }
     let mut all = Summary::default();
     let mut busy = 0;
     for task in tasks {
-        let one = task.await.unwrap();
+        let (one, states) = task.await.unwrap();
+        // What one has put into the queue the others do not count as what is still to be read; how much that is is estimated.
+        let most = states.iter().map(|state| state.queued).max();
+        assert!(most < Some(RECORDS * 3 / 2), "{most:?} are left");
         busy += u32::from(one.tiles > 0);
         all.tiles += one.tiles;
         all.quarantined += one.quarantined;

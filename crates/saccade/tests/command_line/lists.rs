@@ -218,6 +218,29 @@ fn what_a_list_cannot_say_or_change_is_told() {
     );
 }
 
+/// A second such folder would be the same volume.
+#[test]
+fn a_folder_whose_name_can_name_no_volume_is_told() {
+    for (name, is_told) in [
+        ("Gewebe \u{e4}", true),
+        ("volume", false),
+        ("cortex", false),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let scope = folder.path().join(name);
+        let archive = folder.path().join("archive");
+        std::fs::create_dir(&scope).unwrap();
+        std::fs::write(scope.join("tiles.txt"), "a.png 0 0 0\n").unwrap();
+        picture(&scope, "a.png", 10);
+        let ingest = ["ingest", text(&scope), text(&archive), "--once"];
+        let taken = done([&ingest[..], &["--voxel", "4,4,40"]].concat());
+        let said = stderr(&taken);
+        let told = "the volume is called \"volume\"";
+        assert_eq!(said.contains(told), is_told, "{name}: {said}");
+        assert_eq!(said.contains("--volume gives it another"), is_told);
+    }
+}
+
 /// One who corrects a list sees which line counts, once.
 #[test]
 fn lines_that_name_an_image_again_are_told() {
