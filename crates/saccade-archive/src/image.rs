@@ -21,10 +21,13 @@
 use std::io::{BufReader, Cursor, Read, Seek};
 use std::path::{Path, PathBuf};
 
+use bytemuck::Pod;
+use bytemuck::allocation::try_zeroed_vec;
 use glam::UVec2;
 use saccade_core::volume::Dtype;
 use sniff::Kind;
 
+use crate::large_buffer::LargeBuffer;
 use crate::pyramid::Voxel;
 use crate::storage::open_regular;
 
@@ -46,13 +49,13 @@ const MAX_PIXELS: u64 = 1 << 32;
 
 /// A grey image, or one of labels.
 #[derive(Clone, PartialEq, Eq)]
-pub struct Gray<T> {
+pub struct Gray<T: Pod> {
     /// Pixels along x.
     pub width: u32,
     /// Pixels along y.
     pub height: u32,
     /// `width * height` values, x fastest. 0 is black.
-    pub voxels: Vec<T>,
+    pub voxels: LargeBuffer<T>,
 }
 
 /// An image of 8 bits.
@@ -147,27 +150,31 @@ impl Wanted {
         }
         let scale = if self.labels { 1 } else { 257 };
         let mut voxels = allocate(image.voxels.len())?;
-        for (to, &from) in voxels.iter_mut().zip(&image.voxels) {
+        for (to, &from) in voxels.iter_mut().zip(&*image.voxels) {
             *to = u16::from(from) * scale;
         }
-        Ok(Image::Uint16(Gray::new(image.width, image.height, voxels)))
+        Ok(Image::Uint16(Gray::of(image.width, image.height, voxels)))
     }
 }
 
-impl<T> std::fmt::Debug for Gray<T> {
+impl<T: Pod> std::fmt::Debug for Gray<T> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let bits = 8 * size_of::<T>();
         write!(f, "Gray({} x {} x {bits} bits)", self.width, self.height)
     }
 }
 
-impl<T> Gray<T> {
+impl<T: Pod> Gray<T> {
     /// An image of these voxels.
     ///
     /// # Panics
     ///
     /// If there are not `width * height` of them.
     pub fn new(width: u32, height: u32, voxels: Vec<T>) -> Self {
+        Self::of(width, height, voxels.into())
+    }
+
+    fn of(width: u32, height: u32, voxels: LargeBuffer<T>) -> Self {
         let want = u64::from(width) * u64::from(height);
         assert_eq!(
             voxels.len() as u64,
@@ -453,13 +460,19 @@ fn check_ratio(kind: &str, stored: usize, samples: usize, most: usize) -> Result
 }
 
 /// Zeros, or an error where memory does not suffice.
-fn allocate<T: Voxel>(len: usize) -> Result<Vec<T>, ImageError> {
-    let mut voxels = Vec::new();
-    let reserved = voxels.try_reserve_exact(len);
+fn allocate<T: Voxel>(len: usize) -> Result<LargeBuffer<T>, ImageError> {
     let bytes = len.saturating_mul(T::DTYPE.bytes());
-    reserved.map_err(|_| ImageError::Memory { bytes })?;
-    voxels.resize(len, T::default());
-    Ok(voxels)
+    LargeBuffer::zeroed(len).ok_or(ImageError::Memory { bytes })
+}
+
+/// The same for samples of several channels, of which [`gray`] keeps a part in place.
+fn allocate_channels<T: Voxel>(len: usize, channels: usize) -> Result<LargeBuffer<T>, ImageError> {
+    if channels == 1 {
+        return allocate(len);
+    }
+    let bytes = len.saturating_mul(T::DTYPE.bytes());
+    let samples = try_zeroed_vec(len).map_err(|()| ImageError::Memory { bytes })?;
+    Ok(samples.into())
 }
 
 /// Farthest that red, green and blue of a grey pixel lie apart where they are stored as they are:
@@ -473,10 +486,14 @@ const LOSSY: u8 = 24;
 /// `apart` at most, and of any others nothing.
 fn gray<T: Voxel>(
     (width, height): (u32, u32),
-    mut samples: Vec<T>,
+    samples: LargeBuffer<T>,
     channels: usize,
     apart: u8,
 ) -> Result<Gray<T>, ImageError> {
+    if channels == 1 {
+        return Ok(Gray::of(width, height, samples));
+    }
+    let mut samples = samples.into_vec();
     let pixels = samples.len() / channels;
     // One shade of eight bits is so many of these.
     let shade = if T::DTYPE == Dtype::Uint8 { 1 } else { 257 };
@@ -484,7 +501,7 @@ fn gray<T: Voxel>(
         for pixel in 0..pixels {
             samples[pixel] = samples[2 * pixel];
         }
-    } else if channels > 2 {
+    } else {
         for pixel in 0..pixels {
             let rgb = [0, 1, 2].map(|c| u32::from(samples[channels * pixel + c].value()));
             let [r, g, b] = rgb;

@@ -44,6 +44,7 @@ pub mod catalog;
 pub mod check;
 pub mod clock;
 pub mod image;
+mod large_buffer;
 mod percent;
 pub mod pyramid;
 pub mod randomness;
@@ -52,6 +53,7 @@ pub mod tls;
 mod visualization;
 
 pub use catalog::CatalogLocation;
+pub use large_buffer::LargeBuffer;
 pub use visualization::{
     ArchiveError, ArchiveLocation, IDENTITY, LocationError, StorageLocation, VisualizationArchive,
     read_identity,

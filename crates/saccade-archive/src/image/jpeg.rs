@@ -3,7 +3,7 @@
 use turbojpeg::{Colorspace, Decompressor, Image, PixelFormat};
 
 use super::sniff::{broken, check_jpeg};
-use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate, check_ratio, gray};
+use super::{Image as Decoded, ImageError, LOSSY, Wanted, allocate_channels, check_ratio, gray};
 
 /// Progressive files may refine the image as often as they like; this many times are enough.
 const MAX_SCANS: u32 = 500;
@@ -46,7 +46,7 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Decoded, ImageError
             });
         }
     };
-    let mut voxels = allocate(pixels * channels)?;
+    let mut voxels = allocate_channels(pixels * channels, channels)?;
     let image = Image {
         pixels: &mut voxels[..],
         width: header.width,

@@ -6,7 +6,9 @@ use png::{BitDepth, ColorType, Decoder, DecodingError, Transformations};
 
 use super::sniff::{broken, check_png, incomplete};
 use super::tiff::unpack;
-use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, check_ratio, gray};
+use super::{
+    EXACT, Gray, Image, ImageError, Wanted, allocate, allocate_channels, check_ratio, gray,
+};
 
 pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     check_png(bytes)?;
@@ -45,23 +47,23 @@ pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> 
         return Err(broken(format!("its rows do not make {pixels} pixels")));
     }
     if depth == BitDepth::Sixteen {
-        let mut samples = allocate::<u16>(pixels * channels)?;
+        let mut samples = allocate_channels::<u16>(pixels * channels, channels)?;
         reader
             .next_frame(bytemuck::cast_slice_mut(&mut samples))
             .map_err(sort)?;
-        for sample in &mut samples {
+        for sample in &mut *samples {
             *sample = u16::from_be(*sample);
         }
         let image = gray((width, height), samples, channels, EXACT)?;
         return Ok(Image::Uint16(image));
     }
-    let mut voxels = allocate::<u8>(len)?;
+    let mut voxels = allocate_channels::<u8>(len, channels)?;
     reader.next_frame(&mut voxels).map_err(sort)?;
     if bits < 8 {
         // Only labels come as few bits.
         let mut labels = allocate::<u8>(pixels)?;
         unpack(&voxels, row, width as usize, bits, 1, &mut labels);
-        return wanted.of_8(Gray::new(width, height, labels));
+        return wanted.of_8(Gray::of(width, height, labels));
     }
     wanted.of_8(gray((width, height), voxels, channels, EXACT)?)
 }

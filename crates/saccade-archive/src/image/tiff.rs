@@ -12,7 +12,7 @@ mod lzw;
 pub(super) mod pages;
 
 use super::sniff::{HEAD, broken, incomplete};
-use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, gray};
+use super::{EXACT, Gray, Image, ImageError, Wanted, allocate, allocate_channels, gray};
 
 /// What a file is read from.
 trait ReadSeek: Read + Seek {}
@@ -123,7 +123,7 @@ fn decode_page(
         return decode(plain, len, wanted);
     }
     if page.bits == 16 {
-        let mut samples = allocate::<u16>(page.len / 2)?;
+        let mut samples = allocate_channels::<u16>(page.len / 2, channels)?;
         // In this machine's order of bytes.
         decoder
             .read_image_bytes(bytemuck::cast_slice_mut(&mut samples))
@@ -131,7 +131,7 @@ fn decode_page(
         let image = gray((width, height), samples, channels, EXACT)?;
         return Ok(Image::Uint16(image));
     }
-    let mut samples = allocate::<u8>(page.len)?;
+    let mut samples = allocate_channels::<u8>(page.len, channels)?;
     decoder.read_image_bytes(&mut samples).map_err(sort)?;
     if page.bits < 8 {
         let bits = usize::from(page.bits);
@@ -143,7 +143,7 @@ fn decode_page(
         };
         let mut voxels = allocate::<u8>(width as usize * height as usize)?;
         unpack(&samples, page.row, width as usize, bits, scale, &mut voxels);
-        return wanted.of_8(Gray::new(width, height, voxels));
+        return wanted.of_8(Gray::of(width, height, voxels));
     }
     wanted.of_8(gray((width, height), samples, channels, EXACT)?)
 }

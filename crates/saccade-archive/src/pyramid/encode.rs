@@ -23,7 +23,7 @@ use crate::image::{Gray, MAX_EDGE};
 ///
 /// [`EncodeError`]; also for JPEG of 16 bits.
 pub fn encode<T: Voxel>(image: &Gray<T>, encoding: &Encoding) -> Result<Bytes, EncodeError> {
-    Ok(parts::<Mean<T>>(image, encoding)?.file())
+    parts::<Mean<T>>(image, encoding)?.file()
 }
 
 /// Makes the pyramid of an image of labels: a coarser pixel has the label that most of the level-0
@@ -33,7 +33,7 @@ pub fn encode<T: Voxel>(image: &Gray<T>, encoding: &Encoding) -> Result<Bytes, E
 ///
 /// [`EncodeError`].
 pub fn encode_labels<T: Voxel>(image: &Gray<T>) -> Result<Bytes, EncodeError> {
-    Ok(parts::<Mode<T>>(image, &Encoding::Lossless)?.file())
+    parts::<Mode<T>>(image, &Encoding::Lossless)?.file()
 }
 
 pub(super) fn parts<F: Filter>(
@@ -55,15 +55,17 @@ pub(super) fn parts<F: Filter>(
     let task_level = TASK_LEVEL.min(levels.len() - 1);
     let tasks = in_morton_order(levels[task_level].sub_tiles);
     let tasks = tasks.into_par_iter().map_init(
-        || None,
-        |encoder, at| {
+        || (None, nothing_of(&levels)),
+        |(encoder, done), at| {
             let encoder = match encoder {
                 Some(encoder) => encoder,
                 None => encoder.insert(Encoder::new(encoding, dtype)?),
             };
-            let mut task = Task::<F>::new(image, &levels, encoder);
+            let mut task = Task::<F>::new(image, &levels, encoder, done);
             task.sub_tile(task_level, at)?;
-            Ok((at, task.blocks.pop(), task.done))
+            let block = task.blocks.pop();
+            let done: Vec<_> = done.iter_mut().map(Coded::take).collect();
+            Ok((at, block, done))
         },
     );
     let tasks = tasks.collect::<Result<Vec<_>, EncodeError>>()?;
@@ -83,7 +85,8 @@ pub(super) fn parts<F: Filter>(
 
     // What is left is a 256th of the image.
     let mut encoder = Encoder::new(encoding, dtype)?;
-    let mut task = Task::<F>::new(image, &levels, &mut encoder);
+    let mut done = nothing_of(&levels);
+    let mut task = Task::<F>::new(image, &levels, &mut encoder, &mut done);
     for (level, size) in levels.iter().enumerate().skip(task_level + 1) {
         let Some(known) = plane.take() else { break };
         let pixels = F::plane_values(&known, level, (width, height));
@@ -92,7 +95,7 @@ pub(super) fn parts<F: Filter>(
         }
         plane = Some(F::halved(known));
     }
-    for (coded, done) in coded.iter_mut().zip(task.done).skip(task_level + 1) {
+    for (coded, done) in coded.iter_mut().zip(done).skip(task_level + 1) {
         coded.push(done);
     }
     let blank = encoder.blank::<F::Pixel>()?;
@@ -105,6 +108,11 @@ pub(super) fn parts<F: Filter>(
     })
 }
 
+/// No sub-tiles of each level.
+fn nothing_of(levels: &[PyramidLevel]) -> Vec<Coded> {
+    levels.iter().map(|_| Coded::default()).collect()
+}
+
 /// Encodes sub-tiles and what they cover.
 struct Task<'a, F: Filter> {
     image: &'a Gray<F::Pixel>,
@@ -114,7 +122,7 @@ struct Task<'a, F: Filter> {
     blocks: Vec<F::Block>,
     voxels: Box<[F::Pixel; SUB_TILE_VOXELS]>,
     /// Finished sub-tiles per level.
-    done: Vec<Coded>,
+    done: &'a mut [Coded],
 }
 
 impl<'a, F: Filter> Task<'a, F> {
@@ -122,6 +130,7 @@ impl<'a, F: Filter> Task<'a, F> {
         image: &'a Gray<F::Pixel>,
         levels: &'a [PyramidLevel],
         encoder: &'a mut Encoder,
+        done: &'a mut [Coded],
     ) -> Self {
         let blocks = (0..=TASK_LEVEL.min(levels.len() - 1)).map(|_| F::block());
         Self {
@@ -130,7 +139,7 @@ impl<'a, F: Filter> Task<'a, F> {
             encoder,
             blocks: blocks.collect(),
             voxels: Box::new([F::Pixel::default(); SUB_TILE_VOXELS]),
-            done: levels.iter().map(|_| Coded::default()).collect(),
+            done,
         }
     }
 

@@ -306,7 +306,8 @@ fn other_readers_see_a_tiff_file() {
     for big in [false, true] {
         let bytes = parts(&image, &Encoding::Lossless)
             .unwrap()
-            .file_of_width(big);
+            .file_of_width(big)
+            .unwrap();
         assert_eq!(bytes[2], if big { 43 } else { 42 });
         let (seen, sub_ifds) = read_with_tiff(&bytes);
         assert!(seen == image, "big: {big}");
@@ -386,22 +387,22 @@ fn impossible_images_are_refused() {
     refused(GrayImage {
         width: 0,
         height: 0,
-        voxels: Vec::new(),
+        voxels: Vec::new().into(),
     });
     refused(GrayImage {
         width: 7,
         height: 0,
-        voxels: Vec::new(),
+        voxels: Vec::new().into(),
     });
     refused(GrayImage {
         width: 7,
         height: 7,
-        voxels: vec![1; 48],
+        voxels: vec![1; 48].into(),
     });
     refused(GrayImage {
         width: 1 << 20,
         height: 1,
-        voxels: vec![1; 1 << 20],
+        voxels: vec![1; 1 << 20].into(),
     });
     for quality in [0, 101, 255] {
         let result = encode(&noise(3, 3, 1), &Encoding::Jpeg { quality });
@@ -542,7 +543,7 @@ proptest! {
         changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>(), any::<bool>()), 1..12),
     ) {
         let encoding = if jpeg { Encoding::Jpeg { quality: 60 } } else { Encoding::Lossless };
-        let file = parts(&smooth(260, 140), &encoding).unwrap().file_of_width(big);
+        let file = parts(&smooth(260, 140), &encoding).unwrap().file_of_width(big).unwrap();
         let mut bytes = file.to_vec();
         let index_len = parse::index_len(&file).unwrap() as usize;
         for (at, value, in_index) in changes {

@@ -11,11 +11,13 @@ impl Voxel for u8 {}
 impl Voxel for u16 {}
 
 pub(crate) mod pixel {
+    use bytemuck::Pod;
+
     use super::{Debug, Dtype};
 
     /// What pyramids do with voxels. Additions wrap: sums are of a width that holds them, and checks
     /// would keep the vector unit idle.
-    pub trait Pixel: Copy + Ord + Default + Debug + Send + Sync + 'static {
+    pub trait Pixel: Copy + Ord + Default + Debug + Pod + Send + Sync + 'static {
         /// Its name in descriptions.
         const DTYPE: Dtype;
 

@@ -32,7 +32,7 @@ impl Fixture {
         let image = GrayImage {
             width: now.size.x,
             height: now.size.y,
-            voxels: vec![9; (now.size.x * now.size.y) as usize],
+            voxels: vec![9; (now.size.x * now.size.y) as usize].into(),
         };
         let bytes = encode(&image, &Encoding::Lossless).unwrap();
         let bytes = pyramid::named(bytes, &pyramid).unwrap();

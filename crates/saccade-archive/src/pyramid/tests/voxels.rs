@@ -155,7 +155,7 @@ fn other_readers_see_16_bits() {
         let DecodingResult::U16(voxels) = decoder.read_image().unwrap() else {
             panic!("16 bit")
         };
-        assert!(voxels == image.voxels);
+        assert!(image.voxels == voxels);
         let stats = decoder.get_tag(Tag::Unknown(SUB_TILE_STATS)).unwrap();
         assert_eq!(stats.into_u16_vec().unwrap().len(), 6 * 4 * 3);
     }

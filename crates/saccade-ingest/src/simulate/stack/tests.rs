@@ -501,7 +501,8 @@ fn zarrs_of_other_writers_are_stacks() {
             source
                 .region(section, UVec2::new(40, 50), extent.truncate())
                 .unwrap()
-                .voxels,
+                .voxels
+                .into_vec(),
         );
     }
     for name in ["omezarr04_zyx_u8", "omezarr05_zyx_u8_sharded"] {
