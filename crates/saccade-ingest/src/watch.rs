@@ -480,6 +480,8 @@ impl<F: Folders> Watch<F> {
             source,
             path: self.folder.clone(),
         })?;
+        // Else what is put into the place of one later, of its size and time, would not be told from it.
+        self.stamps.add(&self.scanner.learned());
         self.seen |= next != Next::More;
         let now = self.scanner.now();
         if !self.unread.is_empty() {

@@ -163,6 +163,8 @@ pub struct ListWatch<F> {
     untold: VecDeque<Untold>,
     /// What files looked like when they were told of, by the hash of their path; `None` if that is not known.
     seen: HashMap<u64, Option<Seen>>,
+    /// Those of which that was not known, or not all, and that are the same by what is.
+    learned: Vec<(u64, Seen)>,
     told_until: SystemTime,
     stamps: Stamps,
     again: Again<String>,
@@ -224,6 +226,7 @@ impl<F: Folders> ListWatch<F> {
             unread: VecDeque::new(),
             untold: VecDeque::new(),
             seen: HashMap::new(),
+            learned: Vec::new(),
             told_until: SystemTime::UNIX_EPOCH,
             stamps,
             again: Again::default(),
@@ -473,10 +476,14 @@ impl<F: Folders> ListWatch<F> {
         if self.again.holds(key) {
             return false;
         }
-        let same = match self.seen.insert(key, Some(seen)) {
-            Some(Some(before)) => !before.is_replaced_by(seen),
-            Some(None) | None => stamp.modified <= self.told_until,
+        let before = self.seen.insert(key, Some(seen)).flatten();
+        let same = match before {
+            Some(before) => !before.is_replaced_by(seen),
+            None => stamp.modified <= self.told_until,
         };
+        if same && before.is_none_or(Seen::is_of_any_file) {
+            self.learned.push((key, seen));
+        }
         if stamp.is_young(now) || (!same && self.whole) {
             self.again.add(key, &file.to_owned(), now);
         }

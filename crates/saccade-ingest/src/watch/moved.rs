@@ -73,7 +73,7 @@ pub(super) fn go_on(
     );
     if link(folder, kept)? {
         match () {
-            () if moved => stamps.forget(),
+            () if moved => stamps.keep_count(),
             // Renamed with all that is in it.
             () if likeness.untouched * 2 > likeness.found => {}
             // Copies are other files.
@@ -121,7 +121,12 @@ fn compare(
     key: impl Fn(&str) -> u64,
 ) -> Result<Likeness, WatchError> {
     let mut known: HashMap<u64, Seen> = HashMap::new();
-    stamps.each(|key, seen| _ = known.insert(key, seen));
+    stamps.each(|key, seen| {
+        _ = match seen.known() {
+            Some(seen) => known.insert(key, seen),
+            None => known.remove(&key),
+        }
+    });
     let mut reader = RecordReader::new(kept, Cursor::default());
     let mut likeness = Likeness::default();
     loop {

@@ -217,6 +217,8 @@ pub struct Scanner<F> {
     /// Files told of before this process, and not met yet by this one, with what they looked like, if that was
     /// kept.
     told: HashMap<u64, Option<Seen>>,
+    /// What was not known of them, or not all.
+    learned: Vec<(u64, Seen)>,
     /// Files that somebody may still be writing to.
     again: Again,
     /// Whether all folders were gone through once.
@@ -265,6 +267,7 @@ impl<F: Folders> Scanner<F> {
             files: HashMap::new(),
             told: HashMap::new(),
             again: Again::default(),
+            learned: Vec::new(),
             went_round: false,
             closed: HashMap::new(),
             blocked: BTreeSet::new(),
@@ -411,8 +414,13 @@ impl<F: Folders> Scanner<F> {
     /// Says what a file looked like when an earlier process told of it.
     pub(super) fn remember_as(&mut self, key: u64, seen: Seen) {
         if let Some(told) = self.told.get_mut(&key) {
-            *told = Some(seen);
+            *told = seen.known();
         }
+    }
+
+    /// What files look like of which that was not known, or not all, and that are the same by what is: since it was asked last.
+    pub(super) fn learned(&mut self) -> Vec<(u64, Seen)> {
+        std::mem::take(&mut self.learned)
     }
 
     /// Says that a file is told of as it looks now; what to remember it by.
@@ -621,11 +629,15 @@ impl<F: Folders> Scanner<F> {
         }
         let before = self.files.insert(key, seen);
         let told = self.told.remove(&key);
-        let same = match (before, told) {
-            (Some(before), _) | (None, Some(Some(before))) => !before.is_replaced_by(seen),
-            (None, Some(None)) => stamp.modified <= self.told_until,
-            (None, None) => false,
+        let known = before.map(Some).or(told);
+        let same = match known {
+            Some(Some(before)) => !before.is_replaced_by(seen),
+            Some(None) => stamp.modified <= self.told_until,
+            None => false,
         };
+        if same && known.flatten().is_none_or(Seen::is_of_any_file) {
+            self.learned.push((key, seen));
+        }
         let found_now = Found { file, place };
         // By the clock that stamps files, which may be another than this one: what comes later is new in any case.
         let now = self.folders.now();

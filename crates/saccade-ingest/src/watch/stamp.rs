@@ -101,6 +101,23 @@ impl Seen {
         self.content == other.content
     }
 
+    /// What is kept of a file that was told of and of which nothing is known.
+    pub(super) const UNKNOWN: Self = Self {
+        content: 0,
+        changed: 0,
+        number: 0,
+    };
+
+    /// What is known, if anything is.
+    pub(super) fn known(self) -> Option<Self> {
+        (self != Self::UNKNOWN).then_some(self)
+    }
+
+    /// Whether it is what [`Self::of_any_file`] says: another file of the same content is not told from that one.
+    pub(super) fn is_of_any_file(self) -> bool {
+        self.changed == 0 && self.number == 0
+    }
+
     /// Without what another file of the same content has otherwise.
     pub(super) fn of_any_file(self) -> Self {
         Self {

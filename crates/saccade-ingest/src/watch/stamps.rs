@@ -28,10 +28,20 @@ impl Stamps {
         }
     }
 
-    /// Keeps what is the same of copies elsewhere, because the files were moved. What cannot be kept is forgotten.
+    /// Keeps what is the same of copies elsewhere, because the files were moved.
     pub(super) fn keep_content(&self) {
+        self.rewrite(Seen::of_any_file);
+    }
+
+    /// Forgets what files looked like, because they were moved and may have other times, and not how often they were told of.
+    pub(super) fn keep_count(&self) {
+        self.rewrite(|_| Seen::UNKNOWN);
+    }
+
+    /// What cannot be kept is forgotten.
+    fn rewrite(&self, as_now: impl Fn(Seen) -> Seen) {
         let mut all = Vec::new();
-        self.each(|key, seen| all.push([seen.of_any_file().to_bits(), key].map(u64::to_le_bytes)));
+        self.each(|key, seen| all.push([as_now(seen).to_bits(), key].map(u64::to_le_bytes)));
         let part = self.path.with_extension("part");
         let bytes = all.as_flattened().as_flattened();
         if let Err(e) = fs::write(&part, bytes).and_then(|()| fs::rename(&part, &self.path)) {
@@ -40,8 +50,8 @@ impl Stamps {
         }
     }
 
-    /// Forgets all, because the files were moved, and may have other times.
-    pub(super) fn forget(&self) {
+    /// Forgets all.
+    fn forget(&self) {
         match fs::remove_file(&self.path) {
             Err(e) if e.kind() != io::ErrorKind::NotFound => {
                 log::warn!("cannot remove {}: {e}", self.path.display());
@@ -124,6 +134,9 @@ pub(crate) fn fuzz(bytes: &[u8]) {
     stamps.keep_content();
     let content = all_now.iter().map(|(key, seen)| (*key, seen.of_any_file()));
     assert_eq!(all(&stamps), content.collect::<Vec<_>>());
+    stamps.keep_count();
+    let count = all_now.iter().map(|(key, _)| (*key, Seen::UNKNOWN));
+    assert_eq!(all(&stamps), count.collect::<Vec<_>>());
     stamps.forget();
     assert_eq!(all(&stamps), []);
 }

@@ -63,7 +63,7 @@ impl<F: Folders> ListWatch<F> {
         }
         self.stamps.each(|key, seen| {
             if let Some(known) = self.seen.get_mut(&key) {
-                *known = Some(seen);
+                *known = seen.known();
             }
             if let Some(tellings) = unknown.get_mut(&key) {
                 *tellings = tellings.saturating_sub(1);
@@ -80,6 +80,10 @@ impl<F: Folders> ListWatch<F> {
     /// Writes what is to be told; how much it was. What cannot be written is kept.
     pub(super) fn tell(&mut self) -> Result<u64, ListError> {
         let (list, untold, stamps) = (&mut self.records, &mut self.untold, &mut self.stamps);
+        let learned = std::mem::take(&mut self.learned);
+        if list.is_some() {
+            stamps.add(&learned);
+        }
         Ok(list::tell(list.as_mut(), untold, stamps)?)
     }
 

@@ -89,6 +89,52 @@ fn a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not() {
     looks(&mut open(&at("another"), &kept, true).unwrap());
 }
 
+/// However a folder moved, what takes an image's place in it later is told, though it has its size and time.
+#[test]
+fn what_is_replaced_after_a_folder_moved_is_told() {
+    // Of other times, of the same, and renamed as it is.
+    for (ago, is_copy) in [(400, true), (500, true), (500, false)] {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let kept = at("kept");
+        let replace = |value: u8| {
+            let (path, new) = (at("second").join(FILES[1]), at("second").join("new"));
+            image(&new, 40, value);
+            set_age(&new, ago);
+            fs::rename(new, path).unwrap();
+        };
+        fill(&at("first"), 500);
+        looks(&mut open(&at("first"), &kept, false).unwrap());
+        if is_copy {
+            fill(&at("second"), ago);
+            fs::remove_dir_all(at("first")).unwrap();
+        } else {
+            fs::rename(at("first"), at("second")).unwrap();
+        }
+        looks(&mut open(&at("second"), &kept, ago != 500).unwrap());
+        assert_eq!(told(&kept).len(), 3, "{ago} {is_copy}");
+        // Nobody looks meanwhile; the second one is of what was told twice.
+        for n in 1..=2 {
+            replace(70 + n);
+            for _ in 0..2 {
+                looks(&mut open(&at("second"), &kept, false).unwrap());
+                let tiles = told(&kept);
+                assert_eq!(tiles.len(), 3 + usize::from(n), "{ago} {is_copy}");
+                assert!(tiles.last().unwrap().file.ends_with(FILES[1]));
+            }
+        }
+        // Moved again, with that one of which more was told than of the others.
+        fs::rename(at("second"), at("third")).unwrap();
+        looks(&mut open(&at("third"), &kept, true).unwrap());
+        fs::rename(at("third"), at("second")).unwrap();
+        looks(&mut open(&at("second"), &kept, false).unwrap());
+        assert_eq!(told(&kept).len(), 5, "{ago} {is_copy}");
+        replace(99);
+        looks(&mut open(&at("second"), &kept, false).unwrap());
+        assert_eq!(told(&kept).len(), 6, "{ago} {is_copy}");
+    }
+}
+
 /// Renamed with its folder, a file is what it was, and one that took another's place is not, though it has its size and time.
 #[test]
 fn what_was_replaced_before_a_folder_moved_is_told() {

@@ -62,5 +62,19 @@ async fn the_images_of_a_folder_that_moved_are_known_and_those_of_another_refuse
     }
     assert_eq!(scope.records().len(), 2);
     assert!(seen(&archive).await.keys().eq(before.keys()));
-    open(&scope.path(), true).unwrap();
+    let take_in = |moved: bool| {
+        let mut watch = open(&scope.path(), moved).unwrap();
+        follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
+        scope.records().len()
+    };
+    assert_eq!(take_in(true), 2);
+    // What comes into the place of one of them later is told, of its size and time though it is.
+    for n in 1..=2 {
+        fill(&scope.0.path().join("new"), 2 + n, 100);
+        let new = scope.0.path().join("new/pictures/a.tif");
+        fs::rename(new, scope.path().join("pictures/a.tif")).unwrap();
+        for _ in 0..2 {
+            assert_eq!(take_in(false), 2 + usize::from(n));
+        }
+    }
 }
