@@ -23,7 +23,7 @@ use crate::image::{Gray, MAX_EDGE};
 ///
 /// [`EncodeError`]; also for JPEG of 16 bits.
 pub fn encode<T: Voxel>(image: &Gray<T>, encoding: &Encoding) -> Result<Bytes, EncodeError> {
-    parts::<Mean<T>>(image, encoding)?.file()
+    Ok(parts::<Mean<T>>(image, encoding)?.file())
 }
 
 /// Makes the pyramid of an image of labels: a coarser pixel has the label that most of the level-0
@@ -33,7 +33,7 @@ pub fn encode<T: Voxel>(image: &Gray<T>, encoding: &Encoding) -> Result<Bytes, E
 ///
 /// [`EncodeError`].
 pub fn encode_labels<T: Voxel>(image: &Gray<T>) -> Result<Bytes, EncodeError> {
-    parts::<Mode<T>>(image, &Encoding::Lossless)?.file()
+    Ok(parts::<Mode<T>>(image, &Encoding::Lossless)?.file())
 }
 
 pub(super) fn parts<F: Filter>(

@@ -74,14 +74,6 @@ pub enum EncodeError {
     /// The JPEG encoder's streams do not share their tables, as this version's do.
     #[error("the JPEG encoder writes other headers than expected; store the tiles losslessly")]
     Headers,
-    /// The file is longer than memory.
-    #[error(
-        "the pyramid needs {bytes} bytes of memory; cut the image into smaller tiles, or add memory"
-    )]
-    Memory {
-        /// Bytes of the file.
-        bytes: usize,
-    },
     /// The deflate encoder did not finish.
     #[error("the deflate encoder failed; store the tiles as JPEG")]
     Deflate,

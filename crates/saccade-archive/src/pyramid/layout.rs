@@ -8,8 +8,7 @@ use bytes::Bytes;
 use glam::UVec2;
 use saccade_core::volume::Dtype;
 
-use super::{EncodeError, PyramidLevel, SUB_TILE_EDGE, SubTileEntry, parse};
-use crate::large_buffer::LargeBuffer;
+use super::{PyramidLevel, SUB_TILE_EDGE, SubTileEntry, parse};
 
 pub(super) const NEW_SUBFILE_TYPE: u16 = 254;
 pub(super) const IMAGE_WIDTH: u16 = 256;
@@ -152,11 +151,7 @@ pub(super) struct Parts {
 
 impl Parts {
     /// The file: classic TIFF if offsets of four bytes reach everything, else `BigTIFF`.
-    ///
-    /// # Errors
-    ///
-    /// [`EncodeError::Memory`].
-    pub(super) fn file(self) -> Result<Bytes, EncodeError> {
+    pub(super) fn file(self) -> Bytes {
         let tiles: usize = self.coded.iter().flatten().map(|c| c.sub_tiles.len()).sum();
         // More than the description can take.
         let description = 32 * tiles as u64 + 65_536;
@@ -166,32 +161,20 @@ impl Parts {
 
     /// The file, with offsets of eight bytes if `big`. What is in it is let go of at once, so that both together take no more
     /// memory than one.
-    ///
-    /// # Errors
-    ///
-    /// [`EncodeError::Memory`].
-    pub(super) fn file_of_width(self, big: bool) -> Result<Bytes, EncodeError> {
+    pub(super) fn file_of_width(self, big: bool) -> Bytes {
         let writer = Writer { parts: &self, big };
         // Values are of known size: the first pass finds where the data begins, the second says so.
         let begin = writer.describe(0).len();
-        let mut head = writer.describe(begin as u64);
-        let checksum = crc32fast::hash(&head).to_le_bytes();
-        let sealed = parse::last_values(&head).expect("a description that was just written");
-        head[sealed.index].copy_from_slice(&checksum);
-        let bytes = head.len() + self.data_len();
-        let mut file = LargeBuffer::zeroed(bytes).ok_or(EncodeError::Memory { bytes })?;
-        let mut rest = &mut *file;
-        let mut append = |bytes: &[u8]| {
-            let (to, after) = std::mem::take(&mut rest).split_at_mut(bytes.len());
-            to.copy_from_slice(bytes);
-            rest = after;
-        };
-        append(&head);
-        append(&self.blank);
+        let mut file = writer.describe(begin as u64);
+        let checksum = crc32fast::hash(&file).to_le_bytes();
+        let sealed = parse::last_values(&file).expect("a description that was just written");
+        file[sealed.index].copy_from_slice(&checksum);
+        file.reserve_exact(self.data_len());
+        file.extend_from_slice(&self.blank);
         for part in self.coded.into_iter().rev().flatten() {
-            append(&part.bytes);
+            file.extend_from_slice(&part.bytes);
         }
-        Ok(Bytes::from_owner(file))
+        file.into()
     }
 
     fn data_len(&self) -> usize {
