@@ -173,9 +173,13 @@ pub async fn check(
         called: HashMap::new(),
     };
     check.find_owner(&volumes).await?;
+    let mut looked_at = Vec::new();
     for volume in volumes {
         match volume.entry {
-            Ok(entry) => check.volume(&entry).await?,
+            Ok(entry) => {
+                check.volume(&entry).await?;
+                looked_at.push(volume.name);
+            }
             // It is told what it is about.
             Err(_) if revisions.unknown.contains(&volume.name) => {
                 check.unknown.insert(volume.name);
@@ -186,6 +190,12 @@ pub async fn check(
     check.orphans().await?;
     check.recount().await?;
     let mut report = check.report;
+    // As repairs left them.
+    for volume in looked_at {
+        let counts = archive.catalog().statistics(&volume).await?;
+        report.set_aside += counts.quarantined;
+        report.queued += counts.waiting + counts.queued;
+    }
     if options.quick {
         let sizes = objects.iter().map(|object| object.size);
         report.bytes = sizes.sum();

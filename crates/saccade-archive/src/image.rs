@@ -262,8 +262,8 @@ pub enum ImageError {
         x: u32,
         /// Its row.
         y: u32,
-        /// Its red, green and blue.
-        rgb: [u8; 3],
+        /// Its red, green and blue, as they are stored.
+        rgb: [u16; 3],
     },
     /// Whole, perhaps, but of a kind that cannot be read.
     #[error("this kind of image cannot be read ({what}); convert it to an 8-bit grey TIFF or PNG")]
@@ -475,8 +475,8 @@ fn allocate_channels<T: Voxel>(len: usize, channels: usize) -> Result<LargeBuffe
     Ok(samples.into())
 }
 
-/// Farthest that red, green and blue of a grey pixel lie apart where they are stored as they are:
-/// converting between colour spaces rounds.
+/// Farthest that red, green and blue of a grey pixel lie apart where they are stored as they are, in steps of their own
+/// type: converting between colour spaces rounds. A part of the range would not do: dim channels of 16 bits fit in it.
 const EXACT: u8 = 4;
 
 /// The same for lossy storage, which keeps brightness well and colours roughly.
@@ -495,8 +495,6 @@ fn gray<T: Voxel>(
     }
     let mut samples = samples.into_vec();
     let pixels = samples.len() / channels;
-    // One shade of eight bits is so many of these.
-    let shade = if T::DTYPE == Dtype::Uint8 { 1 } else { 257 };
     if channels == 2 {
         for pixel in 0..pixels {
             samples[pixel] = samples[2 * pixel];
@@ -505,12 +503,12 @@ fn gray<T: Voxel>(
         for pixel in 0..pixels {
             let rgb = [0, 1, 2].map(|c| u32::from(samples[channels * pixel + c].value()));
             let [r, g, b] = rgb;
-            if r.max(g).max(b) - r.min(g).min(b) > shade * u32::from(apart) {
+            if r.max(g).max(b) - r.min(g).min(b) > u32::from(apart) {
                 // Both are less than the image's edges.
                 let place = |at: usize| u32::try_from(at).unwrap_or(u32::MAX);
                 let (x, y) = (pixel % width as usize, pixel / width as usize);
                 let (x, y) = (place(x), place(y));
-                let rgb = rgb.map(|v| u8::try_from(v / shade).unwrap_or(u8::MAX));
+                let rgb = rgb.map(|v| u16::try_from(v).unwrap_or(u16::MAX));
                 return Err(ImageError::Color { x, y, rgb });
             }
             // Rec. 601, in thousandths that add up to one: white stays white.

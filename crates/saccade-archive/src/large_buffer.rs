@@ -84,12 +84,6 @@ impl<T: Pod> DerefMut for LargeBuffer<T> {
     }
 }
 
-impl<T: Pod> AsRef<[T]> for LargeBuffer<T> {
-    fn as_ref(&self) -> &[T] {
-        self
-    }
-}
-
 impl<T> FromIterator<T> for LargeBuffer<T> {
     fn from_iter<I: IntoIterator<Item = T>>(values: I) -> Self {
         Vec::from_iter(values).into()

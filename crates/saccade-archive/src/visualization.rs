@@ -58,6 +58,18 @@ pub enum ArchiveError {
         /// Where the catalog is.
         catalog: CatalogLocation,
     },
+    /// The catalog names pyramids in a folder that is not there.
+    #[error(
+        "there is no such folder, but the catalog {catalog} names pyramids in it; mount its disk, or name the folder that the \
+         catalog was made with: {}",
+        path.display()
+    )]
+    NoFolder {
+        /// The folder.
+        path: PathBuf,
+        /// Where the catalog is.
+        catalog: CatalogLocation,
+    },
     /// There are pyramids, but the catalog knows of nothing.
     #[error(
         "{storage} holds pyramids, and the catalog {catalog} is not there or empty: they are another catalog's, or \
@@ -193,7 +205,15 @@ impl VisualizationArchive {
                 } else {
                     Arc::new(MemoryStorage::new())
                 };
-                identity::refuse_strangers(&catalog, &*there, location).await?;
+                match identity::refuse_strangers(&catalog, &*there, location).await {
+                    Err(ArchiveError::Strangers { .. }) if !folder.exists() => {
+                        return Err(ArchiveError::NoFolder {
+                            path: folder.clone(),
+                            catalog: location.catalog().clone(),
+                        });
+                    }
+                    met => met?,
+                }
                 let storage = location.storage().open().await?;
                 (catalog, storage)
             }

@@ -17,6 +17,10 @@ pub struct CheckReport {
     pub retired: u64,
     /// Unnamed objects that are too young to be called orphans.
     pub young: u64,
+    /// Images that are set aside: `saccade ingest` told why, and what it shows of itself does.
+    pub set_aside: u64,
+    /// Images that were announced, and that `saccade ingest` has not taken in yet.
+    pub queued: u64,
     /// What is not as it should be.
     pub findings: Vec<Finding>,
 }

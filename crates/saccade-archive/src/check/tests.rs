@@ -136,6 +136,7 @@ async fn a_whole_archive_is_whole() {
         assert_eq!(report.findings, []);
         assert_eq!((report.tiles, report.damage()), (TILES.into(), 0));
         assert_eq!(report.without_checksums, 0);
+        assert_eq!((report.queued, report.set_aside), (0, 0));
         let sizes = (0..6).map(|n| fs::metadata(fixture.path(n)).unwrap().len());
         assert_eq!(report.bytes, sizes.sum::<u64>());
     }
@@ -303,6 +304,7 @@ async fn repairs_touch_nothing_that_is_whole() {
     assert_eq!(waiting[0].record.tile, "t1");
     let set_aside = fixture.archive.catalog().quarantined(VOLUME).await.unwrap();
     assert_eq!(set_aside[0].tile.as_deref(), Some("t4"));
+    assert_eq!((report.queued, report.set_aside), (1, 1));
     assert_eq!(
         fixture.archive.catalog().entry(VOLUME).await.unwrap().tiles,
         6

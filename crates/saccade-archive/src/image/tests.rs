@@ -427,7 +427,7 @@ fn colours_are_refused_and_shown() {
     };
     for file in files([90, 97, 99]) {
         let error = decode(&file).unwrap_err();
-        let rgb = [90, 97, 99];
+        let rgb = [90, 97, 99_u16];
         let place = matches!(error, ImageError::Color { x: 11, y: 5, rgb: seen } if seen == rgb);
         assert!(place && !error.is_transient(), "{error:?}");
         let said = error.to_string();
@@ -438,6 +438,34 @@ fn colours_are_refused_and_shown() {
     }
     for file in files([99, 97, 96]) {
         assert_eq!(decode(&file).unwrap().voxels[5 * 37 + 11], 97);
+    }
+
+    // Deep images have finer steps, and what is dim in them is in colour as well.
+    let deep = |color: [u16; 3]| {
+        let mut samples: Vec<u16> = { image.voxels.iter() }
+            .flat_map(|&v| [u16::from(v); 3])
+            .collect();
+        samples[3 * (5 * 37 + 11)..][..3].copy_from_slice(&color);
+        let big: Vec<u8> = samples.iter().flat_map(|v| v.to_be_bytes()).collect();
+        let mut tiff = Cursor::new(Vec::new());
+        TiffEncoder::new(&mut tiff)
+            .unwrap()
+            .write_image::<colortype::RGB16>(37, 22, &samples)
+            .unwrap();
+        let png = png_file(37, 22, ColorType::Rgb, BitDepth::Sixteen, &big);
+        [png, tiff.into_inner()]
+    };
+    for file in deep([200, 205, 202]) {
+        let error = decode_as(&file, Wanted::GRAY_16).unwrap_err();
+        let rgb = [200, 205, 202_u16];
+        let place = matches!(error, ImageError::Color { x: 11, y: 5, rgb: seen } if seen == rgb);
+        assert!(place && !error.is_transient(), "{error:?}");
+    }
+    for file in deep([200, 204, 202]) {
+        let Image::Uint16(seen) = decode_as(&file, Wanted::GRAY_16).unwrap() else {
+            panic!("16 bit");
+        };
+        assert_eq!(seen.voxels[5 * 37 + 11], 203);
     }
 
     // A patch, so that subsampling does not average it away.

@@ -191,6 +191,23 @@ mod tests {
         assert!(super::named(Bytes::from_static(b"II*"), "a").is_err());
     }
 
+    /// It is as long as a tile, and only the name is missing.
+    #[test]
+    fn what_nobody_else_has_is_named_in_place() {
+        let image = GrayImage::new(700, 600, vec![7; 700 * 600]);
+        for encoding in [Encoding::Lossless, Encoding::Jpeg { quality: 80 }] {
+            let nameless = encode(&image, &encoding).unwrap();
+            let place = nameless.as_ptr();
+            let one = named(nameless, "a").unwrap();
+            assert_eq!(one.as_ptr(), place, "{encoding:?}");
+            // What somebody else has is left as it is.
+            let other = named(one.clone(), "b").unwrap();
+            assert_ne!(other.as_ptr(), place);
+            assert!(!verify(&one, "a").unwrap().mistaken);
+            assert!(!verify(&other, "b").unwrap().mistaken);
+        }
+    }
+
     #[tokio::test]
     async fn a_quick_look_finds_what_is_wrong_with_index_and_length() {
         let whole = file(Encoding::Lossless);

@@ -184,6 +184,12 @@ fn summary(report: &CheckReport) -> String {
     if report.young > 0 {
         parts.push(format!("{} not entered yet", report.young));
     }
+    if report.queued > 0 {
+        parts.push(format!("{} still to be taken in", report.queued));
+    }
+    if report.set_aside > 0 {
+        parts.push(format!("{} set aside", report.set_aside));
+    }
     if report.without_checksums > 0 {
         parts.push(format!("{} without checksums", report.without_checksums));
     }

@@ -207,6 +207,8 @@ fn bad_tiles_are_set_aside_and_told() {
     ] {
         assert!(said.contains(part), "{part:?} is not in: {said}");
     }
+    let checked = stderr(&done(["check", text(&archive)]));
+    assert!(checked.contains("all whole, 4 set aside"), "{checked}");
     let (_server, url) = Running::start(saccade().args(["serve", text(&archive), "--port", "0"]));
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()

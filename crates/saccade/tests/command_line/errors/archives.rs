@@ -83,6 +83,16 @@ fn what_does_not_belong_together() {
         assert_failed(&output, 1, &strangers);
     }
 
+    let gone = folder.path().join("gone");
+    for arguments in [
+        &["serve", text(&gone), "--port", "0"][..],
+        &["check", text(&gone)],
+    ] {
+        let output = run(arguments.iter().chain(&["--catalog", &catalog]));
+        assert_failed(&output, 1, &["no such folder", text(&gone), &catalog]);
+        assert!(!gone.exists(), "no folder is left behind");
+    }
+
     let thesis = folder.path().join("thesis");
     std::fs::create_dir(&thesis).unwrap();
     std::fs::write(thesis.join("thesis.tex"), "chapter 1").unwrap();
