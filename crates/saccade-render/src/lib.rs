@@ -56,6 +56,10 @@
 //!   not depend on the step.
 //! - Segments are composited front to back in linear light over [`View::background`], until less
 //!   than 1/4096 of the light is left, and encoded as sRGB.
+//! - Where single values count, with [`Mode::Maximum`] and [`Mode::IsoSurface`], half a voxel is measured along the axis along which
+//!   the ray passes most voxels, and samples lie in the planes across it through voxels' middles and faces. What is one
+//!   voxel thin across that axis is met in its middle, and is as bright and as whole from the front as at a slant. What is
+//!   thin across another one is met a quarter of a voxel beside it at most.
 //! - With [`Mode::Maximum`] the largest value along the ray gives the colour of its channel, and the light
 //!   of channels is added; with [`Mode::IsoSurface`] the ray ends where a channel's value, linear
 //!   between samples, passes its bound, lit by how much the surface faces the eye; what a face of the volume or a

@@ -1,7 +1,7 @@
 //! How each channel of a volume is shown.
 
 use saccade_core::transfer::{ColorMap, Histogram, TransferFunction};
-use saccade_core::volume::{Polarity, Volume};
+use saccade_core::volume::{Polarity, Volume, VoxelKind};
 use saccade_render::ChannelView;
 
 use crate::detail::Detail;
@@ -67,6 +67,9 @@ impl Channel {
     /// Colours and opacities that suit the histogram.
     fn suiting(&self, volume: &Volume, index: usize) -> TransferFunction {
         let size_nm = volume.size_nm();
+        if volume.kind == VoxelKind::Labels {
+            return self.histogram.transfer_function_of_labels(size_nm);
+        }
         if volume.channels.len() == 1 {
             return self.histogram.transfer_function(size_nm);
         }

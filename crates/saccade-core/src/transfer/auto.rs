@@ -176,11 +176,57 @@ impl Histogram {
             opacity_length_nm,
         }
     }
+
+    /// A first transfer function where values are numbers of objects: all are seen alike, whatever their numbers, and the surface between
+    /// the opacities' ends is theirs.
+    pub fn transfer_function_of_labels(&self, size_nm: DVec3) -> TransferFunction {
+        let largest = f32::from(self.largest());
+        let high = match self.total() {
+            0 => 1.0,
+            _ => f32::from(self.percentile(1.0)) / largest,
+        };
+        let (longest, shortest) = (size_nm.max_element(), size_nm.min_element());
+        let point = |value, opacity| OpacityPoint { value, opacity };
+        TransferFunction {
+            polarity: Polarity::Bright,
+            color_map: ColorMap::Gray,
+            window: [0.0, high.max(2.0 / largest)],
+            opacity: vec![point(0.0, 0.0), point(1.0 / largest, 0.85)],
+            opacity_length_nm: (longest / 64.0).min(shortest / 2.0),
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn objects_are_seen_whatever_their_numbers() {
+        for dtype in [Dtype::Uint8, Dtype::Uint16] {
+            let mut histogram = Histogram::new(dtype);
+            let empty = histogram.transfer_function_of_labels(DVec3::splat(1000.0));
+            assert_eq!(empty.window, [0.0, 1.0]);
+            for number in [1_u16, 7, 90, 201] {
+                let bytes = number.to_le_bytes();
+                for _ in 0..number {
+                    histogram.add(&bytes[..dtype.bytes()]);
+                }
+            }
+            // By its shades, that would be dark matter, of which the largest numbers are none.
+            assert_eq!(histogram.polarity(), Polarity::Dark);
+            let tf = histogram.transfer_function_of_labels(DVec3::splat(1000.0));
+            assert_eq!(tf.polarity, Polarity::Bright);
+            let largest = f32::from(histogram.largest());
+            let opacity = |number: u16| tf.opacity_at(f32::from(number) / largest);
+            for number in [1, 7, 90, 201] {
+                assert_eq!(opacity(number), opacity(201));
+                assert!(opacity(number) > 0.8);
+            }
+            let [least, most] = tf.window.map(|v| v * largest);
+            assert!(least == 0.0 && (most - 201.0).abs() < 0.01);
+        }
+    }
 
     fn bell(centre: f64, width: f64, tail_centre: f64) -> Histogram {
         let mut histogram = Histogram::default();

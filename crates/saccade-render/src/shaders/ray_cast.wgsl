@@ -1,7 +1,7 @@
 // One ray per pixel, front to back, through whatever bricks are there, for all channels that are seen.
 //
 // A ray is cut into segments of half a voxel of the finest level drawn at their start, measured along the
-// ray; each is sampled once. The residency octree tells which can be skipped; other bricks are
+// ray, or along the axis along which it passes most voxels; each is sampled once. The residency octree tells which can be skipped; other bricks are
 // looked up one by one, and all segments in one are sampled without further lookups. See the crate's documentation for the rules an image follows.
 //
 // Rays drawn at once wait for each other, and drivers that draw on the CPU run both sides of every
@@ -15,6 +15,12 @@ const FIRST_ROW = 32u;
 const ROW = 64u;
 // After so many segments a ray's steps double, and again after as many: all rays end.
 const SEGMENTS_PER_DOUBLING = 8192u;
+
+// Whether samples lie in the planes that voxels' middles, and their faces, lie in. Where values are summed, that would be no better than
+// anywhere else; where single ones count, what is one voxel thin is met in its middle, however it is looked at.
+const IN_PLANES = MODE != MODE_EMISSION_ABSORPTION;
+// What is so close to a plane, in steps, lies in it.
+const IN_PLANE = 0.00390625;
 
 var<private> rays: u32;
 var<private> substituted: u32;
@@ -37,6 +43,28 @@ fn segments_until(until: f32, depth: f32, step: f32) -> u32 {
     return u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
 }
 
+// Where in its segments, of `step` each, a ray is in planes of voxels [0, 1]. The first sample is never where the ray begins: there, at the
+// volume's faces, half of a value is seen.
+fn at_planes(grid: Grid, start: f32, step: f32) -> f32 {
+    let voxels = abs(grid.voxels);
+    let most = largest_of(voxels);
+    let axis = select(select(vec3f(0.0, 0.0, 1.0), vec3f(0.0, 1.0, 0.0), voxels.y == most), vec3f(1.0, 0.0, 0.0), voxels.x == most);
+    // The middles of voxels are planes at any step.
+    let at = dot(grid.eye + start * grid.voxels - 0.5, axis);
+    let along = select(-at, at, dot(grid.voxels, axis) >= 0.0) / (step * most);
+    return min(ceil(along + IN_PLANE) - along, 1.0);
+}
+
+// Depth of the sample of a segment that begins at `start`, of a ray that ends at `end`.
+fn depth_of_sample(start: f32, end: f32, step: f32, sample_at: f32) -> f32 {
+    let rest = end - start;
+    if IN_PLANES {
+        // The last segment may end before its plane.
+        return start + select(0.5 * rest, sample_at * step, rest >= step);
+    }
+    return start + sample_at * min(step, rest);
+}
+
 // Loops, from the outside: look-ups that find no brick at once; stretches of one level and step; regions with
 // nothing to see; bricks; samples.
 
@@ -53,7 +81,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
         cut_normal = select(cut_normal, frame.planes[p].xyz, depths.x > before);
     }
     let urgency = 1.0 + dot(from_middle, from_middle);
-    let sample_at = select(0.5, pixel_noise(pixel), has_flag(FLAG_JITTER));
+    var sample_at = select(0.5, pixel_noise(pixel), has_flag(FLAG_JITTER));
     let everything = all_channels();
     texel = select(1.0 / (steady.brick_grid * f32(BRICK_STORED_EDGE)), vec3f(1.0), JOINED);
 
@@ -106,7 +134,11 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                 texels_of_all = grid.voxels * texel;
             }
             let doublings = min(segments / SEGMENTS_PER_DOUBLING, 64u);
-            let step = 0.5 / voxels_per_depth * exp2(f32(doublings));
+            let per_depth = select(voxels_per_depth, largest_of(abs(grid.voxels)), IN_PLANES);
+            let step = 0.5 / per_depth * exp2(f32(doublings));
+            if IN_PLANES {
+                sample_at = at_planes(grid, start, step);
+            }
             // Level and step hold up to here.
             let stretch = min(level_end, depths.y);
             let doubling = (segments / SEGMENTS_PER_DOUBLING + 1u) * SEGMENTS_PER_DOUBLING;
@@ -117,7 +149,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                 var region = Region(0u, 0u, 3e38);
                 var is_seen = true;
                 loop {
-                    depth = start + sample_at * min(step, depths.y - start);
+                    depth = depth_of_sample(start, depths.y, step, sample_at);
                     if has_flag(FLAG_OCTREE) {
                         region = region_at(level, deepest, depth, ray);
                     }
@@ -165,7 +197,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                 // From brick to brick within the region.
                 loop {
                     let first = min(step, depths.y - start);
-                    depth = start + sample_at * first;
+                    depth = depth_of_sample(start, depths.y, step, sample_at);
                     lost = 0u;
                     var count = 0u;
                     var sampled = 0u;
@@ -184,7 +216,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                         let most = stretch + sample_at * step;
                         for (var index = 0u; index < most_bricks; index += 1u) {
                             let from_ = start + f32(count) * step;
-                            let next = from_ + sample_at * min(step, depths.y - from_);
+                            let next = depth_of_sample(from_, depths.y, step, sample_at);
                             let holds = held != 0u && next < drawn.leaving;
                             if !holds && found == 0u {
                                 let place = place_of(grid, next);
@@ -214,7 +246,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                                 break;
                             }
                             let end = start + f32(count) * step;
-                            let last = end + sample_at * min(step, depths.y - end);
+                            let last = depth_of_sample(end, depths.y, step, sample_at);
                             if index + 1u >= most_bricks || elsewhere != 0u || end >= stretch || last >= around || segments + count >= doubling {
                                 break;
                             }
@@ -292,7 +324,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                     if forgets {
                         held = 0u;
                     }
-                    depth = start + sample_at * min(step, depths.y - start);
+                    depth = depth_of_sample(start, depths.y, step, sample_at);
                     if depth >= around || start >= stretch || segments >= doubling || transmitted <= TERMINATION {
                         break;
                     }

@@ -32,7 +32,7 @@ pub(crate) fn render(scene: &Scene, view: &View, cut: Cut) -> Image {
     }
 }
 
-fn encoded(linear: f64) -> f64 {
+pub(crate) fn encoded(linear: f64) -> f64 {
     let l = linear.clamp(0.0, 1.0);
     if l <= 0.003_130_8 {
         12.92 * l
@@ -56,13 +56,23 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
         while start < far && transmitted > 0.0 {
             let level = level_at(scene, view, ray, start);
             let voxel = scene.volume.voxel_nm * scene.volume.levels[level].downsampling;
-            let half_voxel = 0.5 / (ray / voxel).length();
+            let voxels = ray / voxel;
+            let in_planes = view.mode != Mode::EmissionAbsorption;
+            let half_voxel = 0.5
+                / if in_planes {
+                    voxels.abs().max_element()
+                } else {
+                    voxels.length()
+                };
             let step = match cut {
                 Cut::HalfVoxels => half_voxel,
                 Cut::Fine => half_voxel / 16.0,
             };
             let end = (start + step).min(far);
-            let depth = (start + end) / 2.0;
+            let mut depth = (start + end) / 2.0;
+            if in_planes && start + step <= far {
+                depth = next_plane(eye / voxel, voxels, start, step);
+            }
             let at = eye + ray * depth;
             let mut sum = [0.0; 4];
             let mut surface: Option<(f64, usize)> = None;
@@ -123,6 +133,21 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
         return light;
     }
     std::array::from_fn(|c| light[c] + transmitted * f64::from(view.background[c]))
+}
+
+/// Depth, one step after `start` at most, at which a ray is at a whole number of steps from the middles of voxels, along the axis along which it passes most.
+fn next_plane(eye: DVec3, voxels: DVec3, start: f64, step: f64) -> f64 {
+    let axis = (0..3)
+        .max_by(|&a, &b| voxels[a].abs().total_cmp(&voxels[b].abs()))
+        .unwrap();
+    let steps = |depth: f64| (eye[axis] + voxels[axis] * depth - 0.5) / (voxels[axis] * step);
+    let here = steps(start);
+    // What lies in a plane but for rounding is met in the next.
+    let mut whole = here.ceil();
+    if whole - here < 1.0 / 256.0 {
+        whole += 1.0;
+    }
+    start + (whole - here).min(1.0) * step
 }
 
 /// Stored value of a channel's surface.
