@@ -39,6 +39,7 @@ mod origins;
 mod postgres;
 mod remembered;
 mod revision;
+mod room;
 mod rows;
 mod soundness;
 mod spoilt;

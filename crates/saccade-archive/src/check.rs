@@ -132,6 +132,8 @@ pub async fn check(
     if !is_sound {
         return Ok(report);
     }
+    let lacking = unsound::lacking_indexes(archive, options).await?;
+    report.findings.extend(lacking);
     let objects = archive.storage().entries("tiles/").await?;
     let revisions = Revisions::look(archive, options).await?;
     let volumes = archive.catalog().volumes().await?;

@@ -255,7 +255,7 @@ pub enum ImageError {
     /// A pixel is not grey.
     #[error(
         "the image is in colour (red, green, blue are {rgb:?} at pixel {x}, {y}), but the volume is \
-         grey; convert it to 8 bit grey, or write the channel that matters as an image of its own"
+         grey; convert it to grey, or write the channel that matters as an image of its own"
     )]
     Color {
         /// Column of the first such pixel.

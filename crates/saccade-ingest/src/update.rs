@@ -256,7 +256,7 @@ pub async fn apply(
     };
     // Deletions end what the records said so far, and nothing that they say later.
     let read = catalog.cursor(volume).await.map_err(|e| failed(e, 0))?;
-    let position = read.offset.saturating_sub(1);
+    let read = read.offset;
     let mut group: Vec<(&Line, Known)> = Vec::new();
     let mut gone = HashSet::new();
     let ends = lines.iter().enumerate();
@@ -299,7 +299,7 @@ pub async fn apply(
         // Lines about nothing belong to whatever is around them.
         let another = now.is_some() && section.is_some() && now != section;
         if group.len() >= MOST || (another && group.len() >= ENOUGH) {
-            let applied = transaction(catalog, volume, &group, position).await;
+            let applied = transaction(catalog, volume, &group, read).await;
             summary.add(applied.map_err(|e| failed(e, done))?);
             done += group.len();
             group.clear();
@@ -308,7 +308,7 @@ pub async fn apply(
         group.push((line, known));
     }
     if !group.is_empty() && !cancel.is_cancelled() {
-        let applied = transaction(catalog, volume, &group, position).await;
+        let applied = transaction(catalog, volume, &group, read).await;
         summary.add(applied.map_err(|e| failed(e, done))?);
         done += group.len();
     }
@@ -344,7 +344,7 @@ async fn transaction(
     catalog: &Catalog,
     volume: &str,
     lines: &[(&Line, Known)],
-    position: u64,
+    read: u64,
 ) -> Result<Summary, CatalogError> {
     let mut summary = Summary::default();
     let mut commit = catalog.begin(volume).await?;
@@ -366,7 +366,8 @@ async fn transaction(
                 }
             }
             Change::Delete(_) => {
-                match commit.delete(tile, position, catalog.clock().now()).await? {
+                let now = catalog.clock().now();
+                match commit.delete_seen(tile, read, now).await? {
                     DeleteOutcome::Deleted => Outcome::Deleted,
                     DeleteOutcome::Unchanged | DeleteOutcome::Noted => Outcome::Unchanged,
                 }

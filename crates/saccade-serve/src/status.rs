@@ -1,7 +1,7 @@
 //! How a volume is coming along.
 
-use std::sync::Arc;
-use std::time::UNIX_EPOCH;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use futures::future::BoxFuture;
 use saccade_archive::catalog::{Catalog, CatalogError};
@@ -75,7 +75,7 @@ impl Status {
 /// Why tiles are not taken in.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct HeldUp {
-    /// Machine and process that wait.
+    /// Machine and process that wait, or what they all wait for.
     pub worker: String,
     /// What they wait for, in words for people.
     pub why: String,
@@ -121,6 +121,33 @@ pub trait StatusSource: Send + Sync {
 pub struct CatalogStatus {
     catalog: Catalog,
     volume: String,
+    full: Full,
+}
+
+/// Since when the catalog's disk is found full. Clones share it.
+#[derive(Clone, Debug, Default)]
+struct Full(Arc<Mutex<Option<SystemTime>>>);
+
+impl Full {
+    /// Whoever finds it full does so for all that wait.
+    const WHO: &str = "the catalog's disk";
+
+    fn since(
+        &self,
+        why: Option<String>,
+        now: SystemTime,
+    ) -> Option<saccade_archive::catalog::HeldUp> {
+        let mut since = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(why) = why else {
+            *since = None;
+            return None;
+        };
+        Some(saccade_archive::catalog::HeldUp {
+            worker: Self::WHO.to_owned(),
+            why,
+            since: *since.get_or_insert(now),
+        })
+    }
 }
 
 impl CatalogStatus {
@@ -129,6 +156,7 @@ impl CatalogStatus {
         Self {
             catalog,
             volume: volume.to_owned(),
+            full: Full::default(),
         }
     }
 
@@ -141,7 +169,10 @@ impl CatalogStatus {
             tile: q.tile,
             reason: q.reason,
         };
-        let held_up = self.catalog.held_up(&self.volume).await?;
+        let mut held_up = self.catalog.held_up(&self.volume).await?;
+        let full = self.catalog.held_up_for_space().await?;
+        held_up.extend(self.full.since(full, self.catalog.clock().now()));
+        held_up.sort_by_key(|held| held.since);
         let waits = |held: saccade_archive::catalog::HeldUp| HeldUp {
             since: held
                 .since

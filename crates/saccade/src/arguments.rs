@@ -152,6 +152,9 @@ pub(crate) fn volume_name(text: &str) -> Result<String, String> {
 
 /// The file of a picture.
 pub(crate) fn picture(text: &str) -> Result<PathBuf, String> {
+    if text.is_empty() {
+        return Err("name the file, such as picture.png".into());
+    }
     let path = PathBuf::from(text);
     let png = path
         .extension()
@@ -168,7 +171,8 @@ pub(crate) fn seconds(text: &str) -> Result<std::time::Duration, String> {
     let seconds: f64 = text
         .parse()
         .map_err(|_| "give seconds, such as 30 or 0.5")?;
-    std::time::Duration::try_from_secs_f64(seconds).map_err(|error| error.to_string())
+    std::time::Duration::try_from_secs_f64(seconds)
+        .map_err(|_| "give seconds from 0 on, such as 30 or 0.5".to_owned())
 }
 
 /// A rate in Mpixel/s above 0; `None` for `max`.

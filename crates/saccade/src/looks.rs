@@ -49,7 +49,7 @@ pub(crate) struct Looks {
     camera: Option<Camera>,
 
     /// Channels to show, as numbers from 0 with commas [default: the first four]
-    #[arg(long, value_name = "N,...", value_parser = channels)]
+    #[arg(long, value_name = "N,...", value_parser = channels, allow_negative_numbers = true)]
     channels: Option<Channels>,
 
     /// How to draw: light (that matter sends out and takes up), maximum (the strongest value along
@@ -59,7 +59,7 @@ pub(crate) struct Looks {
 
     /// With --mode surface, the value of the surface, 0 to 1 of the value type's range; for all channels, or each as
     /// in 0:0.4,2:0.6 [default: between the opacities' ends]
-    #[arg(long, value_name = "VALUE,...", value_parser = isos)]
+    #[arg(long, value_name = "VALUE,...", value_parser = isos, allow_negative_numbers = true)]
     iso: Option<Isos>,
 
     /// Show a part only: two opposite corners [voxels of the finest level]
@@ -73,7 +73,14 @@ pub(crate) struct Looks {
     slice: Option<Plane>,
 
     /// With --slice, show what is around the plane as well, so thick in all [nm]; 0 is the plane alone
-    #[arg(long, value_name = "NM", value_parser = thickness_from_text, default_value = "0", requires = "slice")]
+    #[arg(
+        long,
+        value_name = "NM",
+        value_parser = thickness_from_text,
+        default_value = "0",
+        requires = "slice",
+        allow_negative_numbers = true
+    )]
     slab: f64,
 
     /// Cut away what the normal of a plane does not point to; planes as with --slice, but z=40 lies before voxel 40,
@@ -95,7 +102,13 @@ pub(crate) struct Looks {
     /// coarser one), levels coarser than the view asks for, as in 2, or the levels that are drawn, 0 the finest, as
     /// in 1-4, 1- or 1-4+1 (one coarser than the view asks for), the coarsest of the volume where it has none of them;
     /// for all channels, or each as in 0:full,2:1-4+1
-    #[arg(long, value_name = "DETAIL,...", value_parser = details, default_value = "full")]
+    #[arg(
+        long,
+        value_name = "DETAIL,...",
+        value_parser = details,
+        default_value = "full",
+        allow_negative_numbers = true
+    )]
     detail: Details,
 
     /// Colours and opacities: auto, a JSON file, or JSON itself; of the first channel shown, or of channel N, as in
@@ -118,11 +131,23 @@ pub(crate) struct Looks {
     lod_bias: f32,
 
     /// Ceiling for GPU memory [MiB]; where it is full, pictures are coarser
-    #[arg(long, value_name = "MIB", value_parser = gpu_memory_from_text, default_value = "512")]
+    #[arg(
+        long,
+        value_name = "MIB",
+        value_parser = gpu_memory_from_text,
+        default_value = "512",
+        allow_negative_numbers = true
+    )]
     gpu_memory: u64,
 
     /// Ceiling for chunks in main memory [MiB]; what is not kept is read again
-    #[arg(long, value_name = "MIB", value_parser = host_memory_from_text, default_value = "512")]
+    #[arg(
+        long,
+        value_name = "MIB",
+        value_parser = host_memory_from_text,
+        default_value = "512",
+        allow_negative_numbers = true
+    )]
     host_memory: u64,
 }
 

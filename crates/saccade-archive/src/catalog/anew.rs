@@ -56,16 +56,30 @@ fn failed(error: MigrateError) -> sqlx::Error {
     }
 }
 
-async fn in_file(
-    path: &Path,
-    location: &CatalogLocation,
-) -> Result<Option<Vec<&'static str>>, sqlx::Error> {
+/// A catalog in memory, as it should be.
+async fn pattern() -> Result<SqliteConnection, sqlx::Error> {
     let mut pattern = SqliteConnectOptions::new()
         .in_memory(true)
         .connect()
         .await?;
     let migrated = sqlite::MIGRATOR.run_direct(None, &mut pattern, false).await;
     migrated.map_err(failed)?;
+    Ok(pattern)
+}
+
+/// Names of the indexes that a catalog's file should have, and what makes them.
+pub(super) async fn indexes() -> Result<Vec<(String, String)>, sqlx::Error> {
+    let question = "SELECT name, sql FROM sqlite_schema WHERE type = 'index' AND sql IS NOT NULL ORDER BY name";
+    sqlx::query_as(question)
+        .fetch_all(&mut pattern().await?)
+        .await
+}
+
+async fn in_file(
+    path: &Path,
+    location: &CatalogLocation,
+) -> Result<Option<Vec<&'static str>>, sqlx::Error> {
+    let mut pattern = pattern().await?;
     let mut connection = sqlite::options(path, sqlite::Access::Write)
         .connect()
         .await?;

@@ -355,6 +355,32 @@ impl<'c> Commit<'c> {
         Ok(outcome)
     }
 
+    /// Deletes a tile for somebody who knows nothing of records, of which those before `read` have been read: all that they said of
+    /// it is over, but not a newer image that they announced and that is still to come.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn delete_seen(
+        &mut self,
+        tile: &str,
+        read: u64,
+        now: SystemTime,
+    ) -> Result<DeleteOutcome, CatalogError> {
+        let existing = self.existing(tile).await?;
+        let taken_in = existing.map_or(0, |existing| existing.position);
+        let question = "SELECT position FROM waiting \
+                        WHERE volume = $1 AND tile = $2 AND position > $3 ORDER BY position LIMIT 1";
+        let values = [self.volume.into(), tile.into(), taken_in.into()];
+        let newer = self.one(question, &values).await?;
+        let newer = newer
+            .map(|row| rows::unsigned(&row, "position"))
+            .transpose();
+        let newer = newer.map_err(|e| self.catalog.failed(e))?;
+        let end = newer.map_or(read, |newer| newer.min(read));
+        self.delete(tile, end.saturating_sub(1), now).await
+    }
+
     /// Makes it so: when this returns, it survives a power cut. Returns the volume's revision.
     ///
     /// # Errors

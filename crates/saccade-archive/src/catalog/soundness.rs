@@ -6,7 +6,7 @@
 use sqlx::{AssertSqlSafe, SqliteConnection};
 
 use super::database::{Database, Durability, Transaction};
-use super::{Catalog, CatalogError, rows};
+use super::{Catalog, CatalogError, anew, rows};
 
 /// So much SQLite tells at most, which is more than anybody reads.
 const LOOK: &str = "PRAGMA integrity_check(10000)";
@@ -29,6 +29,49 @@ impl Catalog {
         }
     }
 
+    /// Indexes that the catalog's file should have and has not, as it is only after somebody else's hand: what they find is looked
+    /// for row by row then, and nothing keeps two tiles from having one name. Of a PostgreSQL database nothing is told.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn lacking_indexes(&self) -> Result<Vec<String>, CatalogError> {
+        let Database::Sqlite(_) = &self.inner.database else {
+            return Ok(Vec::new());
+        };
+        let names = "SELECT name FROM sqlite_schema WHERE type = 'index'";
+        let there: Vec<String> = self.ask(names, &[], |row| row.get("name")).await?;
+        let should = anew::indexes().await.map_err(|e| self.failed(e))?;
+        let lacking = should.into_iter().map(|(name, _)| name);
+        Ok(lacking.filter(|name| !there.contains(name)).collect())
+    }
+
+    /// Makes an index that the catalog's file lacks. `false` if its rows do not allow it: two tiles have one name.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::ReadOnly`], or what the database says.
+    pub async fn make_index(&self, name: &str) -> Result<bool, CatalogError> {
+        let should = anew::indexes().await.map_err(|e| self.failed(e))?;
+        let mut transaction = self.transaction(Durability::Durable).await?;
+        let Transaction::Sqlite(connection) = &mut transaction else {
+            return Ok(false);
+        };
+        let Some((_, statement)) = should.into_iter().find(|(index, _)| index == name) else {
+            return Ok(false);
+        };
+        // It is one of our own migrations', as SQLite keeps it.
+        let made = sqlx::query(AssertSqlSafe(statement)).execute(&mut **connection);
+        match made.await {
+            Ok(_) => {}
+            Err(sqlx::Error::Database(said)) if primary(&*said) == Some(19) => return Ok(false),
+            Err(other) => return Err(self.failed(other)),
+        }
+        transaction.commit().await.map_err(|e| self.failed(e))?;
+        log::info!("the index {name} is made anew: {}", self.location());
+        Ok(true)
+    }
+
     /// Makes all indexes of a file anew from their tables, if that makes it sound; else it is left as it is, and what is wrong
     /// then is returned. It is also left where an index has more rows than its table: these are lost, and the index is all that
     /// tells of them.
@@ -41,7 +84,7 @@ impl Catalog {
         let Transaction::Sqlite(connection) = &mut transaction else {
             return Ok(Vec::new());
         };
-        let left = match anew(connection).await {
+        let left = match remade(connection).await {
             Ok(left) => left,
             // Rows that are there twice, or pages that mean nothing.
             Err(sqlx::Error::Database(said)) if matches!(primary(&*said), Some(11 | 19)) => {
@@ -62,7 +105,7 @@ fn primary(error: &dyn sqlx::error::DatabaseError) -> Option<u32> {
     Some(error.code()?.parse::<u32>().ok()? & 0xff)
 }
 
-async fn anew(connection: &mut SqliteConnection) -> Result<Vec<String>, sqlx::Error> {
+async fn remade(connection: &mut SqliteConnection) -> Result<Vec<String>, sqlx::Error> {
     let lost = lost_rows(connection).await?;
     if !lost.is_empty() {
         return Ok(lost);

@@ -47,6 +47,38 @@ pub(super) async fn look(
     }))
 }
 
+/// Indexes that the catalog's file lacks, each made anew if that is wanted.
+pub(super) async fn lacking_indexes(
+    archive: &VisualizationArchive,
+    options: &CheckOptions,
+) -> Result<Vec<Finding>, CheckError> {
+    let catalog = archive.catalog();
+    let mut findings = Vec::new();
+    for index in catalog.lacking_indexes().await? {
+        let mut reason = format!("the catalog's file lacks its index {index:?}");
+        let mut repair = None;
+        if !options.repair {
+            reason.push_str(": `saccade check --repair` makes it anew");
+        } else if catalog.make_index(&index).await? {
+            repair = Some(Repair::Reindexed);
+        } else {
+            reason.push_str(
+                ", which cannot be made while two rows have one name: give --acquisition as well, which tells whose it is, and \
+                 repair once more",
+            );
+        }
+        findings.push(Finding {
+            kind: FindingKind::Unsound,
+            volume: None,
+            tile: None,
+            object: None,
+            reason,
+            repair,
+        });
+    }
+    Ok(findings)
+}
+
 /// What is said, once of each kind: it may be the same of thousands of rows.
 fn told(said: &[String]) -> String {
     let mut kinds: Vec<(String, &str, usize)> = Vec::new();

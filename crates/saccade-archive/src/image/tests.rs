@@ -432,7 +432,7 @@ fn colours_are_refused_and_shown() {
         assert!(place && !error.is_transient(), "{error:?}");
         let said = error.to_string();
         assert!(
-            said.contains("11, 5") && said.contains("8 bit grey"),
+            said.contains("11, 5") && said.contains("convert it to grey"),
             "{said}"
         );
     }

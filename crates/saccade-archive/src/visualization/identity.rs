@@ -401,14 +401,18 @@ mod tests {
         let (one, mount) = (folder.path().join("one"), folder.path().join("mount"));
         made(&one, false).await;
         std::fs::create_dir(&mount).unwrap();
-        for place in [mount.clone(), mount.join("archive")] {
+        let places = [
+            (mount.clone(), "Is the disk mounted"),
+            (mount.join("archive"), "mount its disk"),
+        ];
+        for (place, advice) in places {
             let location = crossed(&one, &place);
             for opened in [
                 VisualizationArchive::open(&location).await,
                 VisualizationArchive::create(&location).await,
             ] {
                 let told = opened.map(drop).unwrap_err().to_string();
-                assert!(told.contains("Is the disk mounted"), "{told}");
+                assert!(told.contains(advice), "{told}");
                 let left: Vec<_> = std::fs::read_dir(&mount).unwrap().collect();
                 assert!(left.is_empty(), "{left:?}");
             }

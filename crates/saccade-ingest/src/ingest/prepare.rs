@@ -263,7 +263,7 @@ impl Context<'_> {
             };
             return refused(format!("{nonsense}; check {check}"), bytes);
         }
-        if section == BEFORE_FIRST {
+        if watched && section == BEFORE_FIRST {
             let reason = "the number of its section is less than that of the first one; give the smallest with \
                           --first";
             return refused(reason.to_owned(), bytes);

@@ -1,8 +1,8 @@
 use std::time::SystemTime;
 
 use glam::{DVec2, DVec3, UVec2, UVec3};
-use saccade_archive::acquisition::Cursor;
-use saccade_archive::catalog::NewTile;
+use saccade_archive::acquisition::{Cursor, TileRecord};
+use saccade_archive::catalog::{NewTile, Waiting};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Volume;
 use tempfile::TempDir;
@@ -154,6 +154,53 @@ async fn what_is_said_becomes_so_and_what_cannot_be_is_told() {
         .unwrap();
     commit.finish().await.unwrap();
     assert_eq!(place("s1_1").await, None);
+}
+
+/// A newer image that was announced comes, whether its record was read before or after the deletion; an older one does not.
+#[tokio::test]
+async fn a_deletion_ends_no_image_that_is_still_to_come() {
+    let folder = tempfile::tempdir().unwrap();
+    let catalog = catalog(&folder, 1, 3).await;
+    let announced = |n: u32, position: u64| {
+        let tile = tile(0, n, position);
+        Waiting {
+            position,
+            record: TileRecord {
+                tile: tile.name,
+                file: "again.tif".to_owned(),
+                section: 0,
+                size: tile.size,
+                transform: tile.transform,
+                channel: None,
+            },
+            reason: "not there".to_owned(),
+        }
+    };
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    for (n, position) in [(0, 500), (0, 700), (2, 2)] {
+        commit.wait(&announced(n, position)).await.unwrap();
+    }
+    commit.finish().await.unwrap();
+    let ended = [0, 1, 2].map(|n| deleted(&format!("s0_{n}")));
+    let summary = apply_all(&catalog, &ended).await;
+    assert_eq!((summary.deleted, summary.unknown), (3, 0));
+    // Where they lie afterwards.
+    let comes = async |n: u32, position: u64| {
+        let mut commit = catalog.begin(VOLUME).await.unwrap();
+        let tile = tile(0, n, position);
+        commit.tile(&tile, SystemTime::now()).await.unwrap();
+        commit.finish().await.unwrap();
+        catalog.tile(VOLUME, &tile.name).await.unwrap().is_some()
+    };
+    assert!(!comes(0, 0).await, "what was deleted stays so");
+    assert!(comes(0, 500).await);
+    assert!(!comes(1, 500).await, "what nobody has announced was read");
+    assert!(comes(1, 1000).await);
+    assert!(
+        !comes(2, 2).await,
+        "what is worked on again is the deleted one"
+    );
+    assert!(comes(0, 700).await);
 }
 
 #[test]

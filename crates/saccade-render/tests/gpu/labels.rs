@@ -88,7 +88,7 @@ fn objects_are_lit_as_round_as_they_are() {
     let (mut most, mut least) = (0_u8, u8::MAX);
     for (n, pixel) in (0..64 * 64).zip(seen.rgba.chunks_exact(4)) {
         let ray = camera.ray(DVec2::new(f64::from(n % 64), f64::from(n / 64)) + 0.5, size);
-        let ray = ray.normalize();
+        let ray = ray.normalize_or_zero();
         // Where the ray meets the ball, if it is not near its edge.
         let middle = DVec3::splat(f64::from(EDGE) * VOXEL / 2.0) - camera.eye().xyz;
         let along = middle.dot(ray);

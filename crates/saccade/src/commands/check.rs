@@ -20,7 +20,8 @@ use crate::report::{say, tell};
 /// What the command ends with when tiles are damaged.
 const DAMAGE: u8 = 3;
 
-/// Check that every tile of an archive is there and whole. Ends with 0 if so, with 3 if not.
+/// Check that every tile of an archive is there and whole. Ends with 0 if so, also if it is mended, or will be by `saccade
+/// ingest`, which takes in what is still to be taken in then; with 3 if not, and with 1 if it cannot be looked at.
 #[derive(Args)]
 pub(crate) struct Check {
     #[command(flatten)]
@@ -103,8 +104,8 @@ impl Check {
         let again = report.findings.iter().filter(again).count();
         if again > 0 {
             say(&format!(
-                "{again} tiles that the catalog had lost are taken in again; of those that `saccade update` had deleted, nothing \
-                 tells any more: delete these once more"
+                "{again} tiles that the catalog had lost are taken in again, as their records have them; what `saccade update` had \
+                 said of them nothing tells any more: move and delete them once more"
             ));
         }
         say(&format!("{}: {location}", summary(&report)));

@@ -44,7 +44,13 @@ pub(crate) struct Render {
 
     /// How long to wait for the picture to be complete [s]; 0 takes what one frame brings, which is
     /// of use with --partial
-    #[arg(long, value_name = "SECONDS", value_parser = seconds, default_value = "60")]
+    #[arg(
+        long,
+        value_name = "SECONDS",
+        value_parser = seconds,
+        default_value = "60",
+        allow_negative_numbers = true
+    )]
     timeout: Duration,
 
     /// Write the picture even if it is not complete by then

@@ -2,6 +2,8 @@
 //! where it does not; `SACCADE_FULL_DISK_TESTS=require` makes that a failure, `skip` leaves the tests out.
 
 use std::fs;
+use std::io::Write;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -10,7 +12,7 @@ use super::kills_of_changes::exported;
 use super::{Running, done, simulate};
 
 /// Everything that ingest writes finds no room: pyramids and the catalog. `$1` is the program, `$2` the acquisition, `$3` the disk,
-/// `$4` what becomes of it while the disk is full, `wait` or `KILL`, or `OPEN` for one that starts then, `$5` a folder for what is said and for the archive that is made.
+/// `$4` what becomes of it while the disk is full, `wait` or `KILL`, `OPEN` for one that starts then, or `SEEN` for one that a server tells of, `$5` a folder for what is said and for the archive that is made.
 const SCRIPT: &str = r#"
 set -e
 # Waits until ingest, in the background, says that.
@@ -35,6 +37,28 @@ if [ "$4" = OPEN ]; then
   kill -0 $ingest
   rm "$3/ballast"
   wait $ingest
+  "$1" check "$3/archive" --acquisition "$2" > "$5/check" 2>&1
+  cp -r "$3/archive" "$5/archive"
+  exit 0
+fi
+if [ "$4" = SEEN ]; then
+  # Somebody looks from elsewhere while nothing can be noted in the catalog.
+  "$1" ingest "$2" "$3/archive" --once --lossless 2> "$5/first"
+  "$1" serve "$3/archive" --port 0 > "$5/serve" 2> "$5/serving" &
+  serve=$!
+  "$1" ingest "$2" "$3/archive" --lossless 2> "$5/log" &
+  ingest=$!
+  until_said http "$5/serve"
+  cat /dev/zero > "$3/ballast" 2> "$5/full" || true
+  touch "$5/is-full"
+  until_said yes "$5/seen"
+  rm "$3/ballast"
+  touch "$5/is-free"
+  until_said yes "$5/seen-free"
+  kill -INT $ingest
+  wait $ingest
+  kill -INT $serve
+  wait $serve
   "$1" check "$3/archive" --acquisition "$2" > "$5/check" 2>&1
   cp -r "$3/archive" "$5/archive"
   exit 0
@@ -104,6 +128,9 @@ fn fill_and_go_on(end: &str) {
         .arg(at("out"))
         .stdin(Stdio::null());
     let mut running = Running(command.spawn().unwrap());
+    if end == "SEEN" {
+        look_on(&at("acquisition"), &at("out"));
+    }
     let mut looks = (0..3600).map(|_| {
         std::thread::sleep(Duration::from_millis(50));
         running.0.try_wait().unwrap()
@@ -113,7 +140,7 @@ fn fill_and_go_on(end: &str) {
     let (log, check) = (said("log"), said("check"));
     assert!(status.success(), "{log}\n{}\n{check}", said("again"));
     assert!(
-        end == "OPEN" || log.contains("No space left on device"),
+        matches!(end, "OPEN" | "SEEN") || log.contains("No space left on device"),
         "{log}"
     );
     // What a machine with room makes.
@@ -127,6 +154,65 @@ fn fill_and_go_on(end: &str) {
     ]);
     let [want, got] = [roomy, at("out").join("archive")].map(|archive| exported(&archive));
     assert!(got == want, "other voxels");
+}
+
+/// Has new records come while the disk is full, and looks what the server says of them: why they wait, and for longer than
+/// workers count as alive that give no sign of it.
+fn look_on(acquisition: &Path, out: &Path) {
+    let until = |what: &str, is_so: &dyn Fn() -> bool| {
+        let looks = (0..1200).any(|_| {
+            std::thread::sleep(Duration::from_millis(50));
+            is_so()
+        });
+        assert!(looks, "{what} does not happen");
+    };
+    until("a full disk", &|| out.join("is-full").exists());
+    let said = fs::read_to_string(out.join("serve")).unwrap();
+    let url = { said.split_whitespace() }.find(|word| word.starts_with("http"));
+    let address = format!("{}v/phantom/status.json", url.unwrap());
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    let status = || {
+        let get = async { reqwest::get(&address).await?.json().await };
+        runtime
+            .block_on::<_>(get)
+            .unwrap_or(serde_json::Value::Null)
+    };
+    let reasons = || {
+        let status: serde_json::Value = status();
+        let held = status["held_up"].as_array().cloned().unwrap_or_default();
+        let whys = held.iter().map(|held| held["why"].to_string());
+        whys.collect::<Vec<_>>().join("; ")
+    };
+    let records = acquisition.join("tiles.jsonl");
+    let lines = fs::read_to_string(&records).unwrap();
+    let again = lines.lines().next().unwrap();
+    let again = again.replace("\"tile\":\"", "\"tile\":\"later-");
+    let mut file = fs::OpenOptions::new().append(true).open(&records).unwrap();
+    writeln!(file, "{again}").unwrap();
+    until("a reason", &|| {
+        reasons().contains("no space is left for the catalog")
+    });
+    let mut missing = 0;
+    for _ in 0..50 {
+        std::thread::sleep(Duration::from_millis(500));
+        missing += u32::from(!reasons().contains("no space is left"));
+    }
+    assert_eq!(missing, 0, "it is not told throughout");
+    fs::write(out.join("seen"), "yes").unwrap();
+    until("room", &|| out.join("is-free").exists());
+    let before = lines.matches("\"record\":\"tile\"").count() as u64;
+    until("its end", &|| {
+        status()["tiles"] == before + 1 && !reasons().contains("no space")
+    });
+    fs::write(out.join("seen-free"), "yes").unwrap();
+}
+
+#[test]
+fn why_nothing_comes_in_is_told_by_a_server() {
+    fill_and_go_on("SEEN");
 }
 
 #[test]

@@ -36,8 +36,10 @@ impl Commit<'_> {
     ///
     /// What the database says.
     pub async fn rename(&mut self, tile: &Tile, to: &str) -> Result<(), CatalogError> {
-        let now = self.existing(&tile.name).await?;
-        if now.is_none_or(|now| now.id != tile.id) {
+        // By its row: where the index of names is gone, another may be called so as well.
+        let question = "SELECT id FROM tiles WHERE id = $1 AND volume = $2 AND name = $3";
+        let values = [tile.id.0.into(), self.volume.into(), (&tile.name).into()];
+        if self.one(question, &values).await?.is_none() {
             return Ok(());
         }
         match self.existing(to).await? {

@@ -114,3 +114,61 @@ async fn pyramids_of_lost_tiles_outlast_any_number_of_repairs() {
     let (queued, parked) = fixture.archive.catalog().queued(VOLUME).await.unwrap();
     assert_eq!(queued + parked, u64::from(TILES));
 }
+
+/// Nothing else says that they are gone: all rows are there.
+#[tokio::test]
+async fn indexes_that_are_gone_are_found_and_made_anew() {
+    let fixture = Fixture::new().await;
+    let [by_name, by_section] = ["tiles_by_name", "tiles_by_section"];
+    let drops = [by_name, by_section].map(|index| format!("DROP INDEX {index}"));
+    fixture.meddle(&drops.each_ref().map(String::as_str)).await;
+    let report = fixture.check(false).await;
+    let reasons: Vec<_> = report.findings.iter().map(|f| f.reason.as_str()).collect();
+    assert_eq!((reasons.len(), report.damage()), (2, 2), "{reasons:?}");
+    for (reason, index) in reasons.iter().zip([by_name, by_section]) {
+        assert!(
+            reason.contains(index) && reason.contains("--repair"),
+            "{reason}"
+        );
+    }
+    let repaired = fixture.repair(false).await;
+    let found: Vec<_> = { repaired.findings.iter() }
+        .map(|f| (f.kind, f.repair))
+        .collect();
+    let remade = (FindingKind::Unsound, Some(Repair::Reindexed));
+    assert_eq!((found, repaired.damage()), (vec![remade; 2], 0));
+    assert_eq!(fixture.check(false).await.findings, []);
+    let catalog = fixture.archive.catalog();
+    assert_eq!(catalog.lacking_indexes().await.unwrap(), [""; 0]);
+}
+
+/// What the index would have refused is mended first.
+#[tokio::test]
+async fn a_name_that_two_rows_have_keeps_its_index_from_being_made() {
+    let fixture = Fixture::new().await;
+    let twice = "UPDATE tiles SET name = 't1' WHERE name = 't0'";
+    fixture.meddle(&["DROP INDEX tiles_by_name", twice]).await;
+    let first = fixture.repair(true).await;
+    let index = &first.findings[0];
+    assert_eq!((index.kind, index.repair), (FindingKind::Unsound, None));
+    assert!(
+        index.reason.contains("two rows have one name"),
+        "{}",
+        index.reason
+    );
+    assert!(first.damage() > 0);
+    let second = fixture.repair(true).await;
+    assert_eq!(
+        second.findings[0].repair,
+        Some(Repair::Reindexed),
+        "{:?}",
+        second.findings
+    );
+    assert!(fixture.has_all());
+    assert_eq!(fixture.check(false).await.findings, []);
+    for n in 0..TILES {
+        let name = format!("t{n}");
+        let tile = fixture.archive.catalog().tile(VOLUME, &name).await.unwrap();
+        assert!(tile.is_some(), "{name}");
+    }
+}

@@ -64,6 +64,33 @@ fn volumes_that_are_not_there() {
     assert!(!picture.exists());
 }
 
+/// Values that make no sense are told as such, also where they begin as options do.
+#[test]
+fn values_below_zero_are_values() {
+    let render = ["render", "nowhere", "-o", "never.png"];
+    for (option, value, word) in [
+        ("--slab", "-1", "nanometres"),
+        ("--gpu-memory", "-1", "MiB"),
+        ("--host-memory", "-3", "MiB"),
+        ("--timeout", "-1", "seconds from 0 on"),
+        ("--timeout", "nan", "seconds from 0 on"),
+        ("--channels", "-1", "channel"),
+        ("--detail", "-1", "detail"),
+        ("-o", "", "name the file"),
+    ] {
+        let given = [option, value];
+        let output = match option {
+            "-o" => run(["render", "nowhere"].iter().chain(&given)),
+            "--slab" => run(render.iter().chain(&["--slice", "z=1"]).chain(&given)),
+            _ => run(render.iter().chain(&given)),
+        };
+        assert_failed(&output, 2, &[word]);
+        let said = stderr(&output);
+        assert!(!said.contains("unexpected argument"), "{said}");
+    }
+    assert!(!Path::new("never.png").exists());
+}
+
 /// A catalog and the pyramids of another archive; a cache on disk where other things are.
 #[test]
 fn what_does_not_belong_together() {
