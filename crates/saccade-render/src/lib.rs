@@ -59,7 +59,7 @@
 //! - Where single values count, with [`Mode::Maximum`] and [`Mode::IsoSurface`], half a voxel is measured along the axis along which
 //!   the ray passes most voxels, and samples lie in the planes across it through voxels' middles and faces. What is one
 //!   voxel thin across that axis is met in its middle, and is as bright and as whole from the front as at a slant. What is
-//!   thin across another one is met a quarter of a voxel beside it at most.
+//!   thin across another one is met a quarter of a voxel beside it at most. Of labels, samples lie half way between these planes.
 //! - With [`Mode::Maximum`] the largest value along the ray gives the colour of its channel, and the light
 //!   of channels is added; with [`Mode::IsoSurface`] the ray ends where a channel's value, linear
 //!   between samples, passes its bound, lit by how much the surface faces the eye; what a face of the volume or a
@@ -67,7 +67,8 @@
 //! - **Clipping** ([`Clip`]) cuts the ray before it is cut into segments.
 //! - 16-bit voxels are **exact**: in textures of 16 bit, or as two parts of 8 bit that are joined before they
 //!   are interpolated.
-//! - **Labels** ([`VoxelKind`](saccade_core::volume::VoxelKind)) are not interpolated: no sample has a number that no object has.
+//! - **Labels** ([`VoxelKind`](saccade_core::volume::VoxelKind)) are not interpolated: no sample has a number that no object has. Their surface is that of
+//!   the first voxel met, lit as what belongs to objects lies in the 26 around it, whatever its number.
 //! - What is **missing** is drawn from the nearest coarser level that is there, else from up to two
 //!   levels finer, else not at all. Where no good substitute is there, a brick two levels coarser
 //!   and the coarsest one are asked for first: they come soon and show much.

@@ -51,7 +51,9 @@ fn at_planes(grid: Grid, start: f32, step: f32) -> f32 {
     let axis = select(select(vec3f(0.0, 0.0, 1.0), vec3f(0.0, 1.0, 0.0), voxels.y == most), vec3f(1.0, 0.0, 0.0), voxels.x == most);
     // The middles of voxels are planes at any step.
     let at = dot(grid.eye + start * grid.voxels - 0.5, axis);
-    let along = select(-at, at, dot(grid.voxels, axis) >= 0.0) / (step * most);
+    // Numbers of objects change at voxels' faces, where rounding would decide: between the planes they are those of the voxel.
+    let aside = select(0.0, 0.5, has_flag(FLAG_NEAREST));
+    let along = select(-at, at, dot(grid.voxels, axis) >= 0.0) / (step * most) + aside;
     return min(ceil(along + IN_PLANE) - along, 1.0);
 }
 

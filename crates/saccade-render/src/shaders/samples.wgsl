@@ -176,9 +176,9 @@ fn sampled_at(channel: u32, number: f32, along: vec3f, ahead: f32, step: f32, al
         sample_before[channel] = stored;
         if stored >= iso {
             let rise = stored - before;
-            // Between numbers there is nothing: somewhere between the samples.
-            let share = select((stored - iso) / rise, 0.5, has_flag(FLAG_NEAREST));
-            let back = select(0.0, share, rise > 0.0 && before < iso);
+            // Between numbers there is nothing: the voxel of an object is its surface.
+            let is_between = rise > 0.0 && before < iso && !has_flag(FLAG_NEAREST);
+            let back = select(0.0, (stored - iso) / rise, is_between);
             let at = ahead - back * step;
             if at < hit_at {
                 hit_at = at;
@@ -281,13 +281,13 @@ fn surface_color(channel: u32) -> vec3f {
     return select(bright, own, largest_of(own) >= SURFACE_LIGHT);
 }
 
-// Towards what belongs to objects, around a place among their numbers: how these differ says nothing.
-// Within a voxel, which is what bricks have around them.
+// Towards what belongs to objects, from the voxel at a place among their numbers: how these differ says nothing.
 fn slope_of_labels(at: vec3f, iso: f32) -> vec3f {
+    let middle = (floor(at / texel) + 0.5) * texel;
     var slope = vec3f(0.0);
     for (var n = 0u; n < 27u; n += 1u) {
         let way = vec3f(vec3u(n % 3u, n / 3u % 3u, n / 9u)) - 1.0;
-        slope += select(vec3f(0.0), way, stored_at(at + 0.98 * way * texel) >= iso);
+        slope += select(vec3f(0.0), way, stored_at(middle + way * texel) >= iso);
     }
     return slope;
 }
