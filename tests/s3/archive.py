@@ -52,14 +52,18 @@ class ArchiveTest(unittest.TestCase):
         self.proxy = Proxy(self.store, SEED)
         self.addCleanup(self.proxy.close)
         os.environ["AWS_ENDPOINT_URL"] = self.proxy.url
-        self.prefix = self._testMethodName
-        self.catalog = self.work / f"{self.prefix}.sqlite"
-        self.archive = [f"s3://{BUCKET}/{self.prefix}", "--catalog", self.catalog]
+        self.name_archive(self._testMethodName)
 
     def start(self, *args):
         process = Process(self.work / f"{self.prefix}-{args[0]}.log", *args)
         self.addCleanup(process.stop)
         return process
+
+    def name_archive(self, prefix):
+        """Has what follows be of an archive of that name."""
+        self.prefix = prefix
+        self.catalog = self.work / f"{prefix}.sqlite"
+        self.archive = [f"s3://{BUCKET}/{prefix}", "--catalog", self.catalog]
 
     def named(self):
         """What the catalog names."""

@@ -101,9 +101,7 @@ class Parts(ArchiveTest):
     def test_a_step_that_fails_for_long(self):
         for step in STEPS:
             with self.subTest(step):
-                self.prefix = f"{self._testMethodName}-{step}"
-                self.catalog = self.work / f"{self.prefix}.sqlite"
-                self.archive = [f"s3://{BUCKET}/{self.prefix}", "--catalog", self.catalog]
+                self.name_archive(f"{self._testMethodName}-{step}")
                 self.proxy.order = lambda kind, *_: "busy" if kind == step else None
                 ingest = self.start("ingest", self.acquisition, *self.archive, "--workers", "1")
                 ingest.printed("503")
