@@ -204,13 +204,18 @@ async fn keep_alive(archive: &VisualizationArchive, worker: &Worker) {
     let clock = archive.catalog().clock();
     let mut sign = clock.monotonic();
     let mut look = sign;
+    let mut told = None;
     loop {
         clock.sleep(pause).await;
         if clock.monotonic() - sign + pause > worker.lease() / 4 {
             sign = clock.monotonic();
-            if let Err(e) = archive.catalog().keep_alive(worker).await {
-                log::warn!("no sign of life could be given: {e}");
+            let why = archive.catalog().keep_alive(worker).await.err();
+            let why = why.map(|e| e.to_string());
+            // A disk may be full for days: once is enough.
+            if let Some(why) = why.as_ref().filter(|_| told != why) {
+                log::warn!("no sign of life could be given: {why}");
             }
+            told = why;
         }
         if clock.monotonic() - look + pause > LOOK_FOR_THE_DEAD {
             look = clock.monotonic();
