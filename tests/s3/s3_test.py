@@ -114,14 +114,19 @@ class S3(ArchiveTest):
         served = [self.start("serve", *archive, "--port", "0").printed(r"http://[\w.:]+")
                   for archive in [self.archive, [self.local]]]
         failed = same = 0
+        complete_since = None
         ends = time.monotonic() + 60
         while len(self.named()) < len(self.want) or same < 40:
             self.assertLess(time.monotonic(), ends, f"{len(self.named())} of {len(self.want)}, {same} chunks")
-            complete = len(self.named()) == len(self.want)
+            if complete_since is None and len(self.named()) == len(self.want):
+                complete_since = time.monotonic()
             for key in chunks(served[0]):
+                asked = time.monotonic()
                 got, want = [chunk(url, key) for url in served]
                 failed += got is None
-                if complete and got is not None:
+                # The servers hear of the last tile within a second of its being in the catalog.
+                settled = complete_since is not None and asked - complete_since > 2
+                if settled and got is not None:
                     # Also what was read before, with faults, and remembered.
                     self.assertEqual(got, want)
                     same += 1
