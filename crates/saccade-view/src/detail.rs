@@ -15,7 +15,7 @@ pub fn details_from_text(text: &str) -> Result<Vec<(Option<u32>, Detail)>, Shown
     each_channel(text, detail_from_text).map_or_else(
         || {
             let wanted = "full, content, a number of levels coarser, or the levels from the finest to the \
-                          coarsest, as in 1-4 or 1-4+1; for all channels or each, as in 0:full,2:1-4+1";
+                          coarsest, as in 1-4 or 1-4+1; for all channels or each once, as in 0:full,2:1-4+1";
             ShownError::of(text, "detail of channels", wanted)
         },
         Ok,
@@ -158,6 +158,8 @@ mod tests {
             "1 - 4",
             "full+1",
             "1-4294967296",
+            "0:full,0:2",
+            "full,2",
         ] {
             let error = details_from_text(bad).map_err(|error| error.to_string());
             assert!(

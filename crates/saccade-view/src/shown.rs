@@ -161,14 +161,14 @@ pub fn isos_from_text(text: &str) -> Result<Vec<(Option<u32>, f32)>, ShownError>
     let value = |text: &str| text.parse().ok().filter(|iso| (0.0..=1.0).contains(iso));
     each_channel(text, value).map_or_else(
         || {
-            let wanted = "numbers from 0 to 1, for all channels or each, as in 0:0.4,2:0.6";
+            let wanted = "numbers from 0 to 1, for all channels or each once, as in 0:0.4,2:0.6";
             ShownError::of(text, "value of a surface", wanted)
         },
         Ok,
     )
 }
 
-/// With commas, what is said of all channels, or of each as in `2:WORD`.
+/// With commas, what is said of all channels, or of each as in `2:WORD`; of none twice.
 pub(crate) fn each_channel<T>(
     text: &str,
     word: impl Fn(&str) -> Option<T>,
@@ -177,7 +177,11 @@ pub(crate) fn each_channel<T>(
         Some((channel, text)) => Some((Some(channel.trim().parse().ok()?), word(text.trim())?)),
         None => Some((None, word(text.trim())?)),
     };
-    text.split(',').map(one).collect()
+    let said: Vec<(Option<u32>, T)> = text.split(',').map(one).collect::<Option<_>>()?;
+    let mut channels: Vec<_> = said.iter().map(|(channel, _)| *channel).collect();
+    channels.sort_unstable();
+    channels.dedup();
+    (channels.len() == said.len()).then_some(said)
 }
 
 /// A length that is not negative \[nm\].
@@ -408,7 +412,17 @@ mod tests {
         let each = vec![(None, 0.0), (Some(2), 1.0)];
         assert_eq!(isos_from_text("0, 2:1"), Ok(each));
         for bad in [
-            "", "1.1", "-0.1", "NaN", "2:", ":0.5", "a:0.5", "1:2:0.5", "0.5,",
+            "",
+            "1.1",
+            "-0.1",
+            "NaN",
+            "2:",
+            ":0.5",
+            "a:0.5",
+            "1:2:0.5",
+            "0.5,",
+            "2:0.4,2:0.5",
+            "0.4,0.4",
         ] {
             assert!(isos_from_text(bad).is_err(), "{bad:?}");
         }
