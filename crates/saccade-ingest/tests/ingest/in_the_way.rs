@@ -331,11 +331,9 @@ fn what_lies_where_a_list_says_folders_is_told_before_others_are_offered() {
         fs::remove_file(beside.at("s1")).unwrap();
         beside.folder("s1", "b.tif", 2);
         follow(&mut watch, Until::End, true, &Cancel::new()).unwrap();
-        assert!(
-            !watch
-                .missing()
-                .is_some_and(|missing| missing.contains("s1"))
-        );
+        let missing = watch.missing().unwrap_or_default();
+        // The temporary folder itself may be called so without the image.
+        assert!(!missing.contains("s1/b.tif"), "{missing}");
     }
 }
 
