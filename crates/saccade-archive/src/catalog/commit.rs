@@ -127,7 +127,8 @@ impl<'c> Commit<'c> {
     }
 
     /// Enters a tile, in place of an older one of its name. A record of the same tile in quarantine
-    /// is forgotten. The older one's pyramid, if it has another name, is retired as of `now`.
+    /// is forgotten, unless it is newer and its image awaited. The older one's pyramid, if it has another name, is retired as of
+    /// `now`.
     ///
     /// # Errors
     ///
@@ -194,7 +195,7 @@ impl<'c> Commit<'c> {
         ];
         values.extend(transform.elements().map(Value::from));
         self.run(update, &values).await?;
-        self.end_quarantine(&tile.name).await?;
+        self.end_quarantine(&tile.name, tile.position).await?;
         self.forget_retired(&tile.pyramid).await?;
         let Some(existing) = existing else {
             return Ok(TileOutcome::New);
@@ -308,7 +309,7 @@ impl<'c> Commit<'c> {
         Ok(())
     }
 
-    /// Deletes a tile, and what waits or is in quarantine under its name. Its pyramid is retired as of
+    /// Deletes a tile, and what waits or is in quarantine under its name, unless it is newer. Its pyramid is retired as of
     /// `now`. A tile record that comes later but lies before `position` brings nothing back.
     ///
     /// # Errors
@@ -328,7 +329,7 @@ impl<'c> Commit<'c> {
                      WHERE volume = $1 AND tile = $2 AND position <= $3";
         let values = [self.volume.into(), tile.into(), position.into()];
         self.run(ended, &values).await?;
-        self.end_quarantine(tile).await?;
+        self.end_quarantine(tile, position).await?;
         let (id, outcome) = match existing {
             None => (self.insert_name(tile).await?, DeleteOutcome::Noted),
             Some(e) if e.deleted => (e.id, DeleteOutcome::Unchanged),
@@ -369,15 +370,18 @@ impl<'c> Commit<'c> {
     ) -> Result<DeleteOutcome, CatalogError> {
         let existing = self.existing(tile).await?;
         let taken_in = existing.map_or(0, |existing| existing.position);
-        let question = "SELECT position FROM waiting \
+        let in_queue = "SELECT position FROM waiting \
                         WHERE volume = $1 AND tile = $2 AND position > $3 ORDER BY position LIMIT 1";
-        let values = [self.volume.into(), tile.into(), taken_in.into()];
-        let newer = self.one(question, &values).await?;
-        let newer = newer
-            .map(|row| rows::unsigned(&row, "position"))
-            .transpose();
-        let newer = newer.map_err(|e| self.catalog.failed(e))?;
-        let end = newer.map_or(read, |newer| newer.min(read));
+        let awaited = "SELECT awaited AS position FROM quarantine \
+                       WHERE volume = $1 AND tile = $2 AND awaited > $3 ORDER BY awaited LIMIT 1";
+        let mut end = read;
+        for question in [in_queue, awaited] {
+            let values = [self.volume.into(), tile.into(), taken_in.into()];
+            let newer = self.one(question, &values).await?;
+            let newer = newer.map(|row| rows::unsigned(&row, "position"));
+            let newer = newer.transpose().map_err(|e| self.catalog.failed(e))?;
+            end = newer.map_or(end, |newer| newer.min(end));
+        }
         self.delete(tile, end.saturating_sub(1), now).await
     }
 

@@ -90,7 +90,8 @@ pub struct CatalogChange {
 pub struct Quarantined {
     /// The file, relative to the acquisition archive.
     pub file: String,
-    /// The tile it was to become, if known. A good record of that tile ends its quarantine.
+    /// The tile it was to become, if known. A good record of that tile ends its quarantine, but for an image that is awaited
+    /// and announced later.
     pub tile: Option<String>,
     /// What is wrong and how to mend it.
     pub reason: String,
@@ -98,6 +99,8 @@ pub struct Quarantined {
     pub bytes: Option<u64>,
     /// When.
     pub at: SystemTime,
+    /// Position of its record, if only its image did not come: once it is there, it is taken in.
+    pub awaited: Option<u64>,
 }
 
 /// A record whose file is not whole yet.

@@ -14,8 +14,8 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn quarantined(&self, volume: &str) -> Result<Vec<Quarantined>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let question =
-            "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = $1 ORDER BY id";
+        let question = "SELECT file, tile, reason, bytes, at, awaited FROM quarantine \
+                        WHERE volume = $1 ORDER BY id";
         self.ask(question, &[id.into()], rows::quarantined).await
     }
 
@@ -30,8 +30,8 @@ impl Catalog {
         most: u32,
     ) -> Result<Vec<Quarantined>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let question = "SELECT file, tile, reason, bytes, at FROM quarantine WHERE volume = $1 \
-                        ORDER BY id LIMIT $2";
+        let question = "SELECT file, tile, reason, bytes, at, awaited FROM quarantine \
+                        WHERE volume = $1 ORDER BY id LIMIT $2";
         let values = [id.into(), most.into()];
         self.ask(question, &values, rows::quarantined).await
     }

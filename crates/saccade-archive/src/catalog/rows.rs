@@ -224,6 +224,7 @@ pub(super) fn quarantined(row: &Row) -> Result<Quarantined, Error> {
         reason: legible(row, "reason"),
         bytes: bytes.map(i64::unsigned_abs),
         at: time(row, "at").unwrap_or(UNIX_EPOCH),
+        awaited: unsigned(row, "awaited").ok(),
     })
 }
 

@@ -70,6 +70,7 @@ impl Check<'_> {
             reason,
             bytes: None,
             at: self.archive.catalog().clock().now(),
+            awaited: None,
         };
         let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
         commit.quarantine(&what).await?;

@@ -81,6 +81,7 @@ impl Check<'_> {
                     ),
                     bytes: Some(0),
                     at: self.archive.catalog().clock().now(),
+                    awaited: None,
                 };
                 commit.quarantine(&what).await?;
                 Repair::Quarantined

@@ -275,6 +275,7 @@ fn broken(tile: &str) -> Quarantined {
         reason: "it is damaged".to_owned(),
         bytes: Some(12),
         at: SystemTime::UNIX_EPOCH + Duration::from_millis(1_234_567),
+        awaited: None,
     }
 }
 
@@ -328,8 +329,8 @@ pub(crate) async fn a_replaced_pyramid_is_retired_not_forgotten(place: &Place) {
 
 pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
     let catalog = place.catalog().await;
-    let waiting = waiting("w", 1, at(0.0, 0.0), 5);
-    let broken = broken("b");
+    let unfinished = waiting("w", 1, at(0.0, 0.0), 5);
+    let unreadable = broken("b");
     let cursor = Cursor {
         offset: 700,
         line: 9,
@@ -343,8 +344,8 @@ pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
             .await
             .unwrap();
         commit.cursor(cursor).await.unwrap();
-        commit.wait(&waiting).await.unwrap();
-        commit.quarantine(&broken).await.unwrap();
+        commit.wait(&unfinished).await.unwrap();
+        commit.quarantine(&unreadable).await.unwrap();
         let kept = commit.transform("later", at(1.0, 1.0), Some(3)).await;
         assert_eq!(kept.unwrap(), TransformOutcome::Kept);
         commit
@@ -371,20 +372,44 @@ pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
     };
     assert_eq!(catalog.statistics("v").await.unwrap(), want);
     assert_eq!(catalog.cursor("v").await.unwrap(), cursor);
-    assert_eq!(catalog.waiting("v").await.unwrap(), [waiting]);
-    assert_eq!(catalog.quarantined("v").await.unwrap(), [broken]);
+    assert_eq!(catalog.waiting("v").await.unwrap(), [unfinished]);
+    assert_eq!(catalog.quarantined("v").await.unwrap(), [unreadable]);
 
-    // A good record ends the quarantine of its tile, and only of that.
+    let awaited = |position| Quarantined {
+        awaited: Some(position),
+        ..broken("b")
+    };
+    for position in [2, 3, 4, 9] {
+        catalog.quarantine("v", &awaited(position)).await.unwrap();
+    }
+    // A good record ends the quarantine of its tile, and only of that, and of no image that was announced later.
     catalog
         .commit_tile("v", &tile("c", 0, at(0.0, 0.0), 2))
         .await
         .unwrap();
-    assert_eq!(catalog.quarantined("v").await.unwrap().len(), 1);
+    assert_eq!(catalog.quarantined("v").await.unwrap().len(), 5);
     catalog
         .commit_tile("v", &tile("b", 0, at(0.0, 0.0), 3))
         .await
         .unwrap();
-    assert_eq!(catalog.quarantined("v").await.unwrap(), []);
+    let late = [4, 9].map(awaited);
+    assert_eq!(catalog.quarantined("v").await.unwrap(), late);
+    assert_eq!(catalog.first_quarantined("v", 1).await.unwrap(), late[..1]);
+    // One that somebody deletes who knows of no records goes before the first of them.
+    let mut commit = catalog.begin("v").await.unwrap();
+    let deleted = commit.delete_seen("b", 700, SystemTime::now()).await;
+    assert_eq!(deleted.unwrap(), DeleteOutcome::Deleted);
+    commit
+        .take_up(&waiting("b", 0, at(0.0, 0.0), 4))
+        .await
+        .unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(catalog.quarantined("v").await.unwrap(), [awaited(9)]);
+    for (position, outcome) in [(3, TileOutcome::Superseded), (4, TileOutcome::New)] {
+        let tile = tile("b", 0, at(0.0, 0.0), position);
+        let entered = catalog.commit_tile("v", &tile).await;
+        assert_eq!(entered.unwrap(), outcome);
+    }
 }
 
 pub(crate) fn waiting(

@@ -1,14 +1,14 @@
 //! Records that earlier processes set aside since their image never came: the catalog keeps why, and the records are read
 //! again to find them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 use saccade_archive::acquisition::{Cursor, Record, RecordReader};
 use saccade_archive::catalog::{Quarantined, Waiting};
 
 use super::images::Images;
-use super::waiting::is_absent;
+use super::waiting::{NOT_COME, NOT_COME_BACK};
 
 /// Lines that are read per poll.
 const AT_ONCE: usize = 4096;
@@ -19,24 +19,38 @@ pub(super) struct Earlier {
     reader: RecordReader,
     /// Where those begin that are read by everybody.
     end: Cursor,
-    /// Files, as people know them, and reasons, by tile.
-    wanted: HashMap<String, (String, String)>,
+    /// Positions of those that are wanted, and reasons.
+    wanted: HashMap<u64, String>,
+    /// Tiles, and files as people know them, of those that an earlier version set aside.
+    unplaced: HashSet<(String, String)>,
     read: bool,
+}
+
+/// Whether it was set aside since its image did not come, before the catalog kept where such records are.
+fn is_unplaced(set_aside: &Quarantined) -> bool {
+    let says = |what| set_aside.reason.contains(what);
+    set_aside.bytes.is_none() && (says(NOT_COME) || says(NOT_COME_BACK))
 }
 
 impl Earlier {
     /// `None` if there is nothing to look for.
     pub(super) fn new(acquisition: &Path, end: Cursor, set_aside: &[Quarantined]) -> Option<Self> {
-        let absent = { set_aside.iter() }.filter(|one| is_absent(one));
-        let wanted = absent.filter_map(|one| {
-            let why = (one.file.clone(), one.reason.clone());
-            Some((one.tile.clone()?, why))
-        });
-        let wanted: HashMap<_, _> = wanted.collect();
-        (!wanted.is_empty()).then(|| Self {
+        let (mut wanted, mut unplaced) = (HashMap::new(), HashSet::new());
+        for one in set_aside {
+            match (one.awaited, &one.tile) {
+                (Some(position), _) => _ = wanted.insert(position, one.reason.clone()),
+                (None, Some(tile)) if is_unplaced(one) => {
+                    unplaced.insert((tile.clone(), one.file.clone()));
+                }
+                (None, _) => {}
+            }
+        }
+        let is_needed = !wanted.is_empty() || !unplaced.is_empty();
+        is_needed.then(|| Self {
             reader: RecordReader::new(acquisition, Cursor::default()),
             end,
             wanted,
+            unplaced,
             read: false,
         })
     }
@@ -55,12 +69,16 @@ impl Earlier {
             let Ok(Record::Tile(record)) = line.record else {
                 return None;
             };
-            let (file, reason) = self.wanted.get(&record.tile)?;
-            let is_it = images.name(&record.file) == *file;
-            is_it.then(|| Waiting {
+            let reason = self.wanted.get(&line.offset).cloned();
+            let reason = reason.or_else(|| {
+                let name = (record.tile.clone(), images.name(&record.file));
+                let is_it = !self.unplaced.is_empty() && self.unplaced.contains(&name);
+                is_it.then(|| "its image did not come before".to_owned())
+            })?;
+            Some(Waiting {
                 position: line.offset,
                 record,
-                reason: reason.clone(),
+                reason,
             })
         });
         waiting.collect()
@@ -87,32 +105,40 @@ mod tests {
         let text: String = (0..all).map(line).collect();
         fs::write(folder.path().join(RecordReader::FILE), &text).unwrap();
         let at = |n: usize| (0..n).map(|n| line(n).len() as u64).sum::<u64>();
-        let set_aside = |n: usize, file: &str, reason: &str| Quarantined {
+        let unplaced = |n: usize, file: &str, reason: &str| Quarantined {
             file: file.to_owned(),
             tile: Some(n.to_string()),
             reason: format!("It is not there. {reason} 30.0 s"),
             bytes: None,
             at: SystemTime::UNIX_EPOCH,
+            awaited: None,
+        };
+        let awaited = |n: usize| Quarantined {
+            awaited: Some(at(n)),
+            ..unplaced(n, "whatever", "Whatever")
         };
         let end = Cursor {
             offset: at(all - 2),
             ..Cursor::default()
         };
         let rows = [
-            set_aside(3, "3.tif", "It did not come within"),
-            set_aside(4, "other.tif", "It did not come within"),
-            set_aside(5, "5.tif", "It leads elsewhere within"),
-            set_aside(
+            unplaced(3, "3.tif", "It did not come within"),
+            unplaced(4, "other.tif", "It did not come within"),
+            unplaced(5, "5.tif", "It leads elsewhere within"),
+            unplaced(
                 all - 3,
                 &format!("{}.tif", all - 3),
                 "The file did not come back within",
             ),
+            awaited(7),
+            awaited(all - 4),
             // Those are read by everybody.
-            set_aside(
+            unplaced(
                 all - 1,
                 &format!("{}.tif", all - 1),
                 "It did not come within",
             ),
+            awaited(all - 2),
         ];
         let images = Images::new(folder.path(), None);
         assert!(Earlier::new(folder.path(), end, &rows[2..3]).is_none());
@@ -123,11 +149,11 @@ mod tests {
         };
         assert_eq!(
             (found(&mut earlier), earlier.is_read()),
-            (vec![at(3)], false)
+            (vec![at(3), at(7)], false)
         );
         assert_eq!(
             (found(&mut earlier), earlier.is_read()),
-            (vec![at(all - 3)], true)
+            (vec![at(all - 4), at(all - 3)], true)
         );
     }
 }

@@ -204,6 +204,7 @@ impl Done {
                     reason,
                     bytes: None,
                     at: now,
+                    awaited: None,
                 };
                 if let Some(nonsense) = nonsense(record.transform) {
                     let reason = format!(

@@ -78,6 +78,8 @@ pub(super) struct Unfit {
     pub(super) tile: Option<String>,
     pub(super) reason: String,
     pub(super) bytes: Option<u64>,
+    /// Position of its record, if only its image did not come.
+    pub(super) awaited: Option<u64>,
 }
 
 impl Unfit {
@@ -89,6 +91,7 @@ impl Unfit {
             reason: self.reason.clone(),
             bytes: self.bytes,
             at,
+            awaited: self.awaited,
         }
     }
 }
@@ -487,15 +490,24 @@ pub(super) fn quarantine(
     bytes: Option<u64>,
     pyramid: Option<String>,
 ) -> Outcome {
-    let (file, tile) = (images.name(&record.file), Some(record.tile.clone()));
     Outcome::Quarantine {
-        what: Unfit {
-            file,
-            tile,
-            reason,
-            bytes,
-        },
+        what: unfit(images, record, reason, bytes),
         pyramid,
+    }
+}
+
+pub(super) fn unfit(
+    images: Images<'_>,
+    record: &TileRecord,
+    reason: String,
+    bytes: Option<u64>,
+) -> Unfit {
+    Unfit {
+        file: images.name(&record.file),
+        tile: Some(record.tile.clone()),
+        reason,
+        bytes,
+        awaited: None,
     }
 }
 

@@ -370,7 +370,7 @@ impl Ingest<'_> {
         let queue = async || {
             let mut commit = catalog.begin(self.context.volume).await?;
             for waiting in &came {
-                commit.enqueue(waiting).await?;
+                commit.take_up(waiting).await?;
             }
             commit.finish().await
         };

@@ -200,6 +200,7 @@ impl From<RecordLine> for New {
                     tile: broken.tile.clone(),
                     reason: format!("{broken}; append the record again as it should be"),
                     bytes: Some(line.next.offset - line.offset),
+                    awaited: None,
                 };
                 Self::Done(Outcome::Quarantine {
                     what,

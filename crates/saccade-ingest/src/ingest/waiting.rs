@@ -3,26 +3,20 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use saccade_archive::catalog::{Quarantined, Waiting};
+use saccade_archive::catalog::Waiting;
 
 use super::absent::Absent;
 use super::images::Images;
-use super::prepare::{Look, Outcome, WaitKind, look, quarantine};
+use super::prepare::{Look, Outcome, Unfit, WaitKind, look, unfit};
 
 /// Longest pause between two looks at a file \[polls\].
 const LONGEST_PAUSE: u64 = 16;
 
 /// What is said of a record that was given up since there was no file.
-const NOT_COME: &str = "It did not come within";
+pub(super) const NOT_COME: &str = "It did not come within";
 
 /// The same of one whose file was there before.
-const NOT_COME_BACK: &str = "The file did not come back within";
-
-/// Whether a record was given up since there was no file.
-pub(super) fn is_absent(set_aside: &Quarantined) -> bool {
-    let reason = &set_aside.reason;
-    set_aside.bytes.is_none() && (reason.contains(NOT_COME) || reason.contains(NOT_COME_BACK))
-}
+pub(super) const NOT_COME_BACK: &str = "The file did not come back within";
 
 /// The records that wait, and what their files looked like.
 #[derive(Debug)]
@@ -206,8 +200,9 @@ impl WaitingRoom {
             let polls = u32::try_from(unchanged).unwrap_or(u32::MAX);
             let seconds = self.interval.saturating_mul(polls).as_secs_f64();
             let again = images.again();
+            let is_absent = guest.kind == WaitKind::Incomplete && now.is_none();
             let reason = match guest.kind {
-                WaitKind::Incomplete if now.is_none() => {
+                _ if is_absent => {
                     self.absent.add(guest.waiting.clone());
                     let not_come = match images.are_watched() {
                         true => NOT_COME_BACK,
@@ -223,7 +218,14 @@ impl WaitingRoom {
                 ),
                 WaitKind::Broken => format!("{reason}. Once the file is mended, {again}"),
             };
-            let outcome = quarantine(images, record, reason, now.map(|l| l.bytes), None);
+            let what = Unfit {
+                awaited: is_absent.then_some(*position),
+                ..unfit(images, record, reason, now.map(|l| l.bytes))
+            };
+            let outcome = Outcome::Quarantine {
+                what,
+                pyramid: None,
+            };
             due.push(Due::GiveUp {
                 position: *position,
                 outcome,

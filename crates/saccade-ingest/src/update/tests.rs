@@ -2,7 +2,7 @@ use std::time::SystemTime;
 
 use glam::{DVec2, DVec3, UVec2, UVec3};
 use saccade_archive::acquisition::{Cursor, TileRecord};
-use saccade_archive::catalog::{NewTile, Waiting};
+use saccade_archive::catalog::{NewTile, Quarantined, Waiting};
 use saccade_core::transform::SectionFromTile;
 use saccade_core::volume::Volume;
 use tempfile::TempDir;
@@ -156,11 +156,12 @@ async fn what_is_said_becomes_so_and_what_cannot_be_is_told() {
     assert_eq!(place("s1_1").await, None);
 }
 
-/// A newer image that was announced comes, whether its record was read before or after the deletion; an older one does not.
+/// A newer image that was announced comes, whether its record was read before or after the deletion, also one that was set
+/// aside since it did not come; an older one does not.
 #[tokio::test]
 async fn a_deletion_ends_no_image_that_is_still_to_come() {
     let folder = tempfile::tempdir().unwrap();
-    let catalog = catalog(&folder, 1, 3).await;
+    let catalog = catalog(&folder, 1, 5).await;
     let announced = |n: u32, position: u64| {
         let tile = tile(0, n, position);
         Waiting {
@@ -180,10 +181,37 @@ async fn a_deletion_ends_no_image_that_is_still_to_come() {
     for (n, position) in [(0, 500), (0, 700), (2, 2)] {
         commit.wait(&announced(n, position)).await.unwrap();
     }
+    // What never came twice, and what is broken; the same of what came once more since.
+    for (n, position, awaited) in [
+        (3, 600, true),
+        (3, 800, true),
+        (3, 700, false),
+        (4, 3, true),
+        (4, 700, false),
+    ] {
+        let waiting = announced(n, position);
+        let what = Quarantined {
+            file: waiting.record.file,
+            tile: Some(waiting.record.tile),
+            reason: waiting.reason,
+            bytes: None,
+            at: SystemTime::now(),
+            awaited: awaited.then_some(position),
+        };
+        commit.quarantine(&what).await.unwrap();
+    }
     commit.finish().await.unwrap();
-    let ended = [0, 1, 2].map(|n| deleted(&format!("s0_{n}")));
+    let ended = [0, 1, 2, 3, 4].map(|n| deleted(&format!("s0_{n}")));
     let summary = apply_all(&catalog, &ended).await;
-    assert_eq!((summary.deleted, summary.unknown), (3, 0));
+    assert_eq!((summary.deleted, summary.unknown), (5, 0));
+    let awaited = async || {
+        let set_aside = catalog.quarantined(VOLUME).await.unwrap();
+        { set_aside.iter() }
+            .map(|one| (one.tile.clone().unwrap(), one.awaited))
+            .collect::<Vec<_>>()
+    };
+    let third = |position| ("s0_3".to_owned(), Some(position));
+    assert_eq!(awaited().await, [third(600), third(800)]);
     // Where they lie afterwards.
     let comes = async |n: u32, position: u64| {
         let mut commit = catalog.begin(VOLUME).await.unwrap();
@@ -201,6 +229,14 @@ async fn a_deletion_ends_no_image_that_is_still_to_come() {
         "what is worked on again is the deleted one"
     );
     assert!(comes(0, 700).await);
+    assert!(comes(3, 600).await);
+    assert_eq!(awaited().await, [third(800)]);
+    assert!(!comes(4, 700).await, "of what is broken nothing comes");
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit.take_up(&announced(3, 800)).await.unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(awaited().await, [], "it is in the queue");
+    assert!(comes(3, 800).await);
 }
 
 #[test]

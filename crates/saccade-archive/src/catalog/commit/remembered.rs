@@ -10,9 +10,17 @@ use crate::catalog::database::{Statement, Value};
 use crate::catalog::{CatalogError, NewTile, Quarantined, Waiting, Worker, place, rows};
 
 impl Commit<'_> {
-    pub(super) async fn end_quarantine(&mut self, tile: &str) -> Result<(), CatalogError> {
-        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2";
-        self.run(end, &[self.volume.into(), tile.into()]).await?;
+    /// What the record at `position` says of a tile ends what was set aside of it, but for an image that is awaited and was
+    /// announced later.
+    pub(super) async fn end_quarantine(
+        &mut self,
+        tile: &str,
+        position: u64,
+    ) -> Result<(), CatalogError> {
+        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2 \
+                   AND (awaited IS NULL OR awaited <= $3)";
+        let values = [self.volume.into(), tile.into(), position.into()];
+        self.run(end, &values).await?;
         Ok(())
     }
 
@@ -66,8 +74,8 @@ impl Commit<'_> {
     ///
     /// What the database says.
     pub async fn quarantine(&mut self, what: &Quarantined) -> Result<(), CatalogError> {
-        let insert = "INSERT INTO quarantine (volume, file, tile, reason, bytes, at) \
-                      VALUES ($1, $2, $3, $4, $5, $6)";
+        let insert = "INSERT INTO quarantine (volume, file, tile, reason, bytes, at, awaited) \
+                      VALUES ($1, $2, $3, $4, $5, $6, $7)";
         let bytes = what.bytes.map(|b| i64::try_from(b).unwrap_or(i64::MAX));
         let values = [
             self.volume.into(),
@@ -76,6 +84,7 @@ impl Commit<'_> {
             (&what.reason).into(),
             Value::MaybeInteger(bytes),
             rows::millis(what.at).into(),
+            Value::MaybeInteger(what.awaited.map(u64::cast_signed)),
         ];
         self.run(insert, &values).await?;
         Ok(())
@@ -125,6 +134,22 @@ impl Commit<'_> {
     /// What the database says.
     pub async fn enqueue(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
         self.keep(waiting, 0).await
+    }
+
+    /// Puts a record in the queue whose image came after it was set aside: it is so no more.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn take_up(&mut self, waiting: &Waiting) -> Result<(), CatalogError> {
+        let end = "DELETE FROM quarantine WHERE volume = $1 AND tile = $2 AND awaited = $3";
+        let values = [
+            self.volume.into(),
+            (&waiting.record.tile).into(),
+            waiting.position.into(),
+        ];
+        self.run(end, &values).await?;
+        self.enqueue(waiting).await
     }
 
     /// Remembers a record whose file is not whole yet. Whoever has claimed it keeps it.
