@@ -67,7 +67,7 @@ pub use entries::{
 pub use error::CatalogError;
 pub use history::{History, LastChange};
 pub use location::CatalogLocation;
-pub use origins::{Ahead, Holder, Naming, Origin, Placing};
+pub use origins::{Ahead, Holder, NamedRow, Naming, Origin, Placing};
 pub use revision::WrongRevision;
 pub use spoilt::{Listed, SpoiltTile};
 pub use workers::{Claim, HeldUp, Worker};

@@ -25,6 +25,7 @@ mod ahead;
 mod called;
 mod cursor;
 mod described;
+mod doubled;
 mod half_deleted;
 mod misnamed;
 mod misplaced;
@@ -108,7 +109,8 @@ pub enum CheckError {
 /// ingest.
 ///
 /// The catalog's own file is looked at before, if it is SQLite's: where it is damaged, that alone is found. With
-/// [`CheckOptions::repair`] its indexes are made anew, and where it is sound then, the rest follows.
+/// [`CheckOptions::repair`] its indexes are made anew, and where it is sound then, the rest follows. Where the index of names is gone and
+/// rows have one name, the one that its newest record speaks of is kept, and the index made.
 ///
 /// Where the records are at hand, the catalog is held against them: a tile that it lacks, or of which it says something else
 /// than the record, is found, and given back to ingest if that is wanted; one that has another tile's name is called as its record is; one that lies elsewhere than its newest record says is moved
@@ -133,7 +135,13 @@ pub async fn check(
         return Ok(report);
     }
     let lacking = unsound::lacking_indexes(archive, options).await?;
-    report.findings.extend(lacking);
+    let mut pending = Vec::new();
+    for (index, finding) in lacking {
+        if finding.repair.is_none() {
+            pending.push((report.findings.len(), index));
+        }
+        report.findings.push(finding);
+    }
     let objects = archive.storage().entries("tiles/").await?;
     let revisions = Revisions::look(archive, options).await?;
     let volumes = archive.catalog().volumes().await?;
@@ -151,6 +159,7 @@ pub async fn check(
         hasher: Keyed::new(archive.randomness()),
         named: HashSet::new(),
         shared: HashSet::new(),
+        lacks_index: !pending.is_empty(),
         given_back: HashSet::new(),
         unknown: HashSet::new(),
         known: volumes.iter().map(|volume| volume.name.clone()).collect(),
@@ -192,6 +201,10 @@ pub async fn check(
     check.orphans().await?;
     check.recount().await?;
     let mut report = check.report;
+    for (number, index) in pending.into_iter().filter(|_| options.repair) {
+        let finding = &mut report.findings[number];
+        unsound::make_at_last(archive, options, &index, finding).await?;
+    }
     // As repairs left them.
     for volume in looked_at {
         let counts = archive.catalog().statistics(&volume).await?;
@@ -219,6 +232,8 @@ struct Check<'a> {
     named: HashSet<u64>,
     /// Pyramids of which it was found that several tiles name them.
     shared: HashSet<String>,
+    /// Whether the catalog lacks an index, so that rows may have one name.
+    lacks_index: bool,
     /// Volume and name of tiles that were given back for that.
     given_back: HashSet<(String, String)>,
     /// Volumes of whose tiles nothing is known.
@@ -274,6 +289,7 @@ impl Check<'_> {
         self.is_history_sure = false;
         self.read_up_to(entry).await?;
         self.read_records(entry).await;
+        self.doubled(entry).await?;
         self.described(entry);
         self.ahead(entry).await?;
         // Not those that are counted: what the counts leave out would be called nobody's.

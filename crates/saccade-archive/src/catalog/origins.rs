@@ -44,6 +44,21 @@ pub struct Naming {
     pub has_volume: bool,
 }
 
+/// A row that has a name which another has as well.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NamedRow {
+    /// Its id.
+    pub id: TileId,
+    /// The name.
+    pub name: String,
+    /// Its section, if it can be.
+    pub section: Option<u32>,
+    /// Position of its record, if it can be.
+    pub position: Option<u64>,
+    /// Name of its pyramid.
+    pub pyramid: String,
+}
+
 /// The row that has a tile's name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Holder {
@@ -162,6 +177,28 @@ impl Catalog {
         };
         let values = [id.into(), tile.into()];
         Ok(self.ask(question, &values, holder).await?.pop())
+    }
+
+    /// Rows that have a name which another row of the volume has, by id: none, as long as the catalog has its indexes. Looks at
+    /// all tiles of the volume.
+    ///
+    /// # Errors
+    ///
+    /// [`CatalogError::UnknownVolume`], or what the database says.
+    pub async fn rows_of_one_name(&self, volume: &str) -> Result<Vec<NamedRow>, CatalogError> {
+        let id = self.volume_id(volume).await?;
+        let question = "SELECT id, name, section, position, pyramid FROM tiles WHERE volume = $1 AND name IN \
+                        (SELECT name FROM tiles WHERE volume = $1 GROUP BY name HAVING count(*) > 1) ORDER BY id";
+        let named = |row: &Row| {
+            Ok(NamedRow {
+                id: TileId(row.get("id")?),
+                name: rows::legible(row, "name"),
+                section: rows::section(row).ok(),
+                position: rows::unsigned(row, "position").ok(),
+                pyramid: rows::legible(row, "pyramid"),
+            })
+        };
+        self.ask(question, &[id.into()], named).await
     }
 
     /// The rows whose tiles lie where a record says that was not read yet, and those of tiles that one has deleted; without what cannot

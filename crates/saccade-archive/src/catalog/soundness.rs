@@ -29,8 +29,9 @@ impl Catalog {
         }
     }
 
-    /// Indexes that the catalog's file should have and has not, as it is only after somebody else's hand: what they find is looked
-    /// for row by row then, and nothing keeps two tiles from having one name. Of a PostgreSQL database nothing is told.
+    /// Indexes that the catalog's file should have and has not, or has otherwise, as it is only after somebody else's hand: what
+    /// they find is looked for row by row then, and nothing keeps two tiles from having one name. Of a PostgreSQL database nothing
+    /// is told.
     ///
     /// # Errors
     ///
@@ -39,14 +40,15 @@ impl Catalog {
         let Database::Sqlite(_) = &self.inner.database else {
             return Ok(Vec::new());
         };
-        let names = "SELECT name FROM sqlite_schema WHERE type = 'index'";
-        let there: Vec<String> = self.ask(names, &[], |row| row.get("name")).await?;
+        let names = "SELECT name, sql FROM sqlite_schema WHERE type = 'index' AND sql IS NOT NULL";
+        let there = |row: &_| Ok((rows::legible(row, "name"), rows::legible(row, "sql")));
+        let there: Vec<(String, String)> = self.ask(names, &[], there).await?;
         let should = anew::indexes().await.map_err(|e| self.failed(e))?;
-        let lacking = should.into_iter().map(|(name, _)| name);
-        Ok(lacking.filter(|name| !there.contains(name)).collect())
+        let lacking = should.into_iter().filter(|index| !there.contains(index));
+        Ok(lacking.map(|(name, _)| name).collect())
     }
 
-    /// Makes an index that the catalog's file lacks. `false` if its rows do not allow it: two tiles have one name.
+    /// Makes an index that the catalog's file lacks, or has otherwise. `false` if its rows do not allow it: two tiles have one name.
     ///
     /// # Errors
     ///
@@ -60,7 +62,10 @@ impl Catalog {
         let Some((_, statement)) = should.into_iter().find(|(index, _)| index == name) else {
             return Ok(false);
         };
-        // It is one of our own migrations', as SQLite keeps it.
+        // Both are of our own migrations, as SQLite keeps them.
+        let drop = format!("DROP INDEX IF EXISTS {name}");
+        let dropped = sqlx::query(AssertSqlSafe(drop)).execute(&mut **connection);
+        dropped.await.map_err(|e| self.failed(e))?;
         let made = sqlx::query(AssertSqlSafe(statement)).execute(&mut **connection);
         match made.await {
             Ok(_) => {}

@@ -47,11 +47,11 @@ pub(super) async fn look(
     }))
 }
 
-/// Indexes that the catalog's file lacks, each made anew if that is wanted.
+/// Indexes that the catalog's file lacks, each made anew if that is wanted and the rows allow it.
 pub(super) async fn lacking_indexes(
     archive: &VisualizationArchive,
     options: &CheckOptions,
-) -> Result<Vec<Finding>, CheckError> {
+) -> Result<Vec<(String, Finding)>, CheckError> {
     let catalog = archive.catalog();
     let mut findings = Vec::new();
     for index in catalog.lacking_indexes().await? {
@@ -61,22 +61,41 @@ pub(super) async fn lacking_indexes(
             reason.push_str(": `saccade check --repair` makes it anew");
         } else if catalog.make_index(&index).await? {
             repair = Some(Repair::Reindexed);
-        } else {
-            reason.push_str(
-                ", which cannot be made while two rows have one name: give --acquisition as well, which tells whose it is, and \
-                 repair once more",
-            );
         }
-        findings.push(Finding {
+        let finding = Finding {
             kind: FindingKind::Unsound,
             volume: None,
             tile: None,
             object: None,
             reason,
             repair,
-        });
+        };
+        findings.push((index, finding));
     }
     Ok(findings)
+}
+
+/// Makes an index once rows of one name are mended as far as can be.
+pub(super) async fn make_at_last(
+    archive: &VisualizationArchive,
+    options: &CheckOptions,
+    index: &str,
+    finding: &mut Finding,
+) -> Result<(), CheckError> {
+    if archive.catalog().make_index(index).await? {
+        finding.repair = Some(Repair::Reindexed);
+        return Ok(());
+    }
+    let how = match &options.acquisition {
+        Some(_) => {
+            "of which the records of the acquisition do not tell whose it is: take those out of its table \"tiles\" that are not, or \
+             put a copy of the catalog there, from which `saccade ingest` goes on"
+        }
+        None => "give --acquisition as well, which tells whose it is",
+    };
+    let said = format!(", which cannot be made while two rows have one name: {how}");
+    finding.reason.push_str(&said);
+    Ok(())
 }
 
 /// What is said, once of each kind: it may be the same of thousands of rows.

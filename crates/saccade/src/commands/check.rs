@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Result, bail};
 use clap::Args;
 use indicatif::ProgressBar;
 use saccade_archive::acquisition::RecordReader;
@@ -21,7 +21,8 @@ use crate::report::{say, tell};
 const DAMAGE: u8 = 3;
 
 /// Check that every tile of an archive is there and whole. Ends with 0 if so, also if it is mended, or will be by `saccade
-/// ingest`, which takes in what is still to be taken in then; with 3 if not, and with 1 if it cannot be looked at.
+/// ingest`, which takes in what is still to be taken in then; with 3 if not, and with 1 if it cannot be looked at. Images that
+/// were set aside are none of its tiles: how many there are is told, and changes nothing of that.
 #[derive(Args)]
 pub(crate) struct Check {
     #[command(flatten)]
@@ -70,11 +71,13 @@ impl Check {
         if let Some(folder) = self.acquisition.as_ref().filter(|folder| !is_read(folder))
             && !watched.as_ref().is_some_and(|watched| watched.is_dir())
         {
-            say(&format!(
-                "no records ({}) are in the acquisition's folder, and nothing is compared with any: {}",
+            // Who asks for it would take what is told otherwise for the result of it.
+            bail!(
+                "no records ({}) to compare the archive with are in the folder that --acquisition names: {}; give the folder that the \
+                 microscope wrote to, or leave --acquisition out",
                 RecordReader::FILE,
                 folder.display()
-            ));
+            );
         }
         let options = CheckOptions {
             quick: self.quick,

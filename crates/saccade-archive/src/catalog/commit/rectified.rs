@@ -6,7 +6,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::Commit;
 use crate::catalog::database::Value;
-use crate::catalog::{Ahead, CatalogError, ChangeReason, Tile, TileId, place};
+use crate::catalog::{Ahead, CatalogError, ChangeReason, NamedRow, Tile, TileId, place};
 
 impl Commit<'_> {
     /// Has a tile name another pyramid, if it is still as it was found. The one that it named is not retired: it is another's.
@@ -186,6 +186,23 @@ impl Commit<'_> {
         // Nobody knows whether it was counted.
         self.uncounted = true;
         Ok(())
+    }
+
+    /// Takes a row out of the catalog whose name another row has; the pyramid that it names is left.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn take_out(&mut self, row: &NamedRow) -> Result<(), CatalogError> {
+        let take = "DELETE FROM tiles WHERE volume = $1 AND id = $2 AND EXISTS \
+                    (SELECT 1 FROM tiles other WHERE other.volume = $1 AND other.id <> $2 AND other.name = tiles.name)";
+        self.run(take, &[self.volume.into(), row.id.0.into()])
+            .await?;
+        self.uncounted = true;
+        match row.section.filter(|z| *z < self.extent.z) {
+            Some(section) => self.show_again(section).await,
+            None => Ok(()),
+        }
     }
 
     async fn log_again(&mut self, tile: &Tile) -> Result<(), CatalogError> {
