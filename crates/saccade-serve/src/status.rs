@@ -170,7 +170,7 @@ impl CatalogStatus {
             reason: q.reason,
         };
         let mut held_up = self.catalog.held_up(&self.volume).await?;
-        let full = self.catalog.held_up_for_space().await?;
+        let full = self.catalog.held_up_for_space();
         held_up.extend(self.full.since(full, self.catalog.clock().now()));
         held_up.sort_by_key(|held| held.since);
         let waits = |held: saccade_archive::catalog::HeldUp| HeldUp {

@@ -13,7 +13,7 @@ use super::kills_of_changes::exported;
 use super::{done, simulate};
 
 /// Everything that ingest writes finds no room: pyramids and the catalog. `$1` is the program, `$2` the acquisition, `$3` the disk,
-/// `$4` what becomes of it while the disk is full, `wait` or `KILL`, `PYRAMIDS` if only they find no room, `OPEN` for one that starts then, or `SEEN` for one that a server tells of, `$5` a folder for what is said and for the archive that is made.
+/// `$4` what becomes of it while the disk is full, `wait` or `KILL`, `PYRAMIDS` if only they find no room, `OPEN` for one that starts then, `SEEN` for one that a server tells of, or `LATE` for one that does and starts then, `$5` a folder for what is said and for the archive that is made.
 const SCRIPT: &str = r#"
 set -e
 # Waits until ingest, in the background, says that.
@@ -42,15 +42,23 @@ if [ "$4" = OPEN ]; then
   cp -r "$3/archive" "$5/archive"
   exit 0
 fi
-if [ "$4" = SEEN ]; then
+if [ "$4" = SEEN ] || [ "$4" = LATE ]; then
   # Somebody looks from elsewhere while nothing can be noted in the catalog.
   "$1" ingest "$2" "$3/archive" --once --lossless 2> "$5/first"
   "$1" serve "$3/archive" --port 0 > "$5/serve" 2> "$5/serving" &
   serve=$!
-  "$1" ingest "$2" "$3/archive" --lossless 2> "$5/log" &
-  ingest=$!
+  go_on() {
+    "$1" ingest "$2" "$3/archive" --lossless 2> "$5/log" &
+    ingest=$!
+  }
+  if [ "$4" = SEEN ]; then
+    go_on "$@"
+  fi
   until_said http "$5/serve"
   cat /dev/zero > "$3/ballast" 2> "$5/full" || true
+  if [ "$4" = LATE ]; then
+    go_on "$@"
+  fi
   touch "$5/is-full"
   until_said yes "$5/seen"
   rm "$3/ballast"
@@ -152,7 +160,7 @@ fn fill_and_go_on(end: &str) {
         .stdin(Stdio::null())
         .process_group(0);
     let mut running = Group(command.spawn().unwrap());
-    if end == "SEEN" {
+    if end == "SEEN" || end == "LATE" {
         look_on(&at("acquisition"), &at("out"));
     }
     let mut looks = (0..3600).map(|_| {
@@ -238,6 +246,12 @@ fn look_on(acquisition: &Path, out: &Path) {
 #[test]
 fn why_nothing_comes_in_is_told_by_a_server() {
     fill_and_go_on("SEEN");
+}
+
+/// It cannot even say there that it is at work.
+#[test]
+fn why_nothing_comes_in_is_told_of_who_begins_on_a_full_disk() {
+    fill_and_go_on("LATE");
 }
 
 #[test]
