@@ -57,9 +57,10 @@
 //! - Segments are composited front to back in linear light over [`View::background`], until less
 //!   than 1/4096 of the light is left, and encoded as sRGB.
 //! - Where single values count, with [`Mode::Maximum`] and [`Mode::IsoSurface`], half a voxel is measured along the axis along which
-//!   the ray passes most voxels, and samples lie in the planes across it through voxels' middles and faces. What is one
-//!   voxel thin across that axis is met in its middle, and is as bright and as whole from the front as at a slant. What is
-//!   thin across another one is met a quarter of a voxel beside it at most. Of labels, samples lie half way between these planes.
+//!   the ray passes most voxels, its main axis, and samples lie in the planes across it through voxels' middles and faces. Where the ray
+//!   crosses planes through voxels' middles across the other axes, samples lie there as well, and stand for that of a face between two
+//!   middles. So what is one voxel thin is met in its middle, and is as bright and as whole from wherever it is looked at. A
+//!   maximum is also that of where the ray begins and ends. Of labels, samples lie half way between the planes of the main axis.
 //! - With [`Mode::Maximum`] the largest value along the ray gives the colour of its channel, and the light
 //!   of channels is added; with [`Mode::IsoSurface`] the ray ends where a channel's value, linear
 //!   between samples, passes its bound, lit by how much the surface faces the eye; what a face of the volume or a

@@ -16,8 +16,9 @@ const ROW = 64u;
 // After so many segments a ray's steps double, and again after as many: all rays end.
 const SEGMENTS_PER_DOUBLING = 8192u;
 
-// Whether samples lie in the planes that voxels' middles, and their faces, lie in. Where values are summed, that would be no better than
-// anywhere else; where single ones count, what is one voxel thin is met in its middle, however it is looked at.
+// Whether samples lie in the planes that voxels' middles, and their faces, lie in: those across the axis along which a ray passes most, and
+// where it crosses others' middles in between, there as well. Where values are summed, that would be no better than anywhere else; where
+// single ones count, what is one voxel thin is met in its middle, however it lies and is looked at.
 const IN_PLANES = MODE != MODE_EMISSION_ABSORPTION;
 // What is so close to a plane, in steps, lies in it.
 const IN_PLANE = 0.00390625;
@@ -43,12 +44,20 @@ fn segments_until(until: f32, depth: f32, step: f32) -> u32 {
     return u32(clamp(ceil((until - depth) / step), 1.0, f32(SEGMENTS_PER_DOUBLING)));
 }
 
+// The axis along which a way is longest, the first of those that are equal.
+fn main_axis(way: vec3f) -> vec3<bool> {
+    let lengths = abs(way);
+    let most = largest_of(lengths);
+    let is_x = lengths.x == most;
+    let is_y = !is_x && lengths.y == most;
+    return vec3<bool>(is_x, is_y, !is_x && !is_y);
+}
+
 // Where in its segments, of `step` each, a ray is in planes of voxels [0, 1]. The first sample is never where the ray begins: there, at the
 // volume's faces, half of a value is seen.
 fn at_planes(grid: Grid, start: f32, step: f32) -> f32 {
-    let voxels = abs(grid.voxels);
-    let most = largest_of(voxels);
-    let axis = select(select(vec3f(0.0, 0.0, 1.0), vec3f(0.0, 1.0, 0.0), voxels.y == most), vec3f(1.0, 0.0, 0.0), voxels.x == most);
+    let most = largest_of(abs(grid.voxels));
+    let axis = select(vec3f(0.0), vec3f(1.0), main_axis(grid.voxels));
     // The middles of voxels are planes at any step.
     let at = dot(grid.eye + start * grid.voxels - 0.5, axis);
     // Numbers of objects change at voxels' faces, where rounding would decide: between the planes they are those of the voxel.
@@ -61,10 +70,24 @@ fn at_planes(grid: Grid, start: f32, step: f32) -> f32 {
 fn depth_of_sample(start: f32, end: f32, step: f32, sample_at: f32) -> f32 {
     let rest = end - start;
     if IN_PLANES {
-        // The last segment may end before its plane.
-        return start + select(0.5 * rest, sample_at * step, rest >= step);
+        return start + select(sample_at * step, 0.5 * rest, is_cut_short(rest, step, sample_at));
     }
     return start + sample_at * min(step, rest);
+}
+
+// Whether a ray ends before the plane of its last segment, which is so long.
+fn is_cut_short(rest: f32, step: f32, sample_at: f32) -> bool {
+    return sample_at * step >= rest;
+}
+
+// How far before the first sample of a row, at `depth`, it is looked for planes [steps, negative], if that is not as for others: up to where
+// the ray, or its level and step, `begin`, and in the last segment up to the sample before. 1 where it is as for others.
+fn look_back(start: f32, begin: f32, depth: f32, step: f32, sample_at: f32, is_cut: bool) -> f32 {
+    let since_start = (depth - start) / step;
+    if start <= begin {
+        return -since_start;
+    }
+    return select(1.0, -(1.0 - sample_at + since_start), is_cut);
 }
 
 // Loops, from the outside: look-ups that find no brick at once; stretches of one level and step; regions with
@@ -105,7 +128,8 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
     surface_light = 0.0;
     for (var c = 0u; c < channel_count(); c += 1u) {
         largest_seen[c] = 0.0;
-        sample_before[c] = 0.0;
+        sample_before[c] = -1.0;
+        beside_before[c] = 0.0;
     }
     rays = select(0u, 1u, inside && start < depths.y && level_count() > 0u);
     var going = rays > 0u;
@@ -143,6 +167,7 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
             }
             // Level and step hold up to here.
             let stretch = min(level_end, depths.y);
+            let begin = start;
             let doubling = (segments / SEGMENTS_PER_DOUBLING + 1u) * SEGMENTS_PER_DOUBLING;
 
             // Region by region.
@@ -300,7 +325,15 @@ fn trace(pixel: vec2u, inside: bool) -> vec3f {
                     } else {
                         substituted += count * countOneBits(elsewhere & visible);
                     }
-                    let row = Row(sampled, depth, f32(count), step, -LOG2_E * first * nm_per_depth, segments == 0u);
+                    var row = Row(sampled, depth, f32(count), step, -LOG2_E * first * nm_per_depth, segments == 0u, false, 1.0, 0.0);
+                    if IN_PLANES {
+                        let rest = depths.y - start;
+                        row.is_cut = is_cut_short(rest, step, sample_at);
+                        row.look_back = look_back(start, begin, depth, step, sample_at, row.is_cut);
+                        // Where the next level or step begins, or nothing.
+                        let next = start + ceil((stretch - start) / step) * step;
+                        row.until = (min(depths.y, next) - depth) / step;
+                    }
                     var seen = Seen(light, transmitted);
                     var taken = 0.0;
                     // Channels of several levels, which are few, are sampled below.

@@ -6,6 +6,8 @@
 const LOG2_E = 1.4426950408889634;
 // Light that is left when a ray ends: less than one step of the picture even on white.
 const TERMINATION = 0.000244140625;
+// Of a plane that is not crossed.
+const NOWHERE = 3e38;
 // The largest part of a surface's colour, where it faces the eye, at least.
 const SURFACE_LIGHT = 0.5;
 
@@ -20,8 +22,10 @@ var<private> next_low: array<vec3f, 2>;
 var<private> turns: vec2f;
 // The way to the next sample per depth, of all channels that are drawn from the level that is wanted.
 var<private> texels_of_all: vec3f;
-// The sample before, of surfaces [0, 1].
+// The sample before, of surfaces [0, 1]; -1 where there is none.
 var<private> sample_before: array<f32, SLOTS>;
+// Where it was, from its segment's own place [steps].
+var<private> beside_before: array<f32, SLOTS>;
 // The levels that the largest values were drawn from and wanted at, in false colours.
 var<private> largest_from: array<vec2u, SLOTS>;
 
@@ -129,8 +133,8 @@ fn way_of(channel: u32, alike: bool) -> vec3f {
 }
 
 // A place in a channel's brick: of a sample, by its number in the row of bricks, so far from the first sample where one channel is seen, and from the
-// eye where several are.
-fn in_brick(channel: u32, number: f32, along: vec3f) -> vec3f {
+// eye where several are. It is so many voxels outside of it at most: what lies within half a one is known in its border.
+fn in_brick(channel: u32, number: f32, along: vec3f, outside: f32) -> vec3f {
     var first = first_texel;
     var low = first_low;
     if SLOTS == 1u {
@@ -148,46 +152,122 @@ fn in_brick(channel: u32, number: f32, along: vec3f) -> vec3f {
     }
     let at = first + along;
     if BOUNDED {
-        return clamp(at, low, low + f32(BRICK_EDGE) * texel);
+        return clamp(at, low - outside * texel, low + (f32(BRICK_EDGE) + outside) * texel);
     }
     return at;
 }
 
-// Takes a sample of a channel, by its number in the row of bricks, at a place `along` the ray that is so far ahead of the first. Linear
-// RGB and extinction of it, or what the mode keeps of it.
-fn sampled_at(channel: u32, number: f32, along: vec3f, ahead: f32, step: f32, alike: bool) -> vec4f {
-    let stored = stored_at(in_brick(channel, number, along));
-    if MODE == MODE_EMISSION_ABSORPTION {
-        let color = color_of(channel, stored);
-        if FALSE_COLORS != FALSE_NONE {
-            let levels = levels_of[channel];
-            return vec4f(false_color(color.rgb, levels.x, levels.y), color.a);
-        }
-        return color;
+// Takes a sample of a channel, by its number in the row of bricks, at a place `along` the ray. Linear RGB and extinction of it.
+fn color_at(channel: u32, number: f32, along: vec3f) -> vec4f {
+    let color = color_of(channel, stored_at(in_brick(channel, number, along, 0.0)));
+    if FALSE_COLORS != FALSE_NONE {
+        let levels = levels_of[channel];
+        return vec4f(false_color(color.rgb, levels.x, levels.y), color.a);
     }
+    return color;
+}
+
+// Takes a sample where single values count, so many steps `beside` the place of its segment's own, which is so far ahead of the first, and
+// keeps what the mode does of it.
+fn keep_at(channel: u32, number: f32, along: vec3f, ahead: f32, step: f32, beside: f32, is_first: bool, alike: bool) {
+    let way = step * way_of(channel, alike);
+    let stored = stored_at(in_brick(channel, number, along + beside * way, 0.5));
     if MODE == MODE_MAXIMUM {
         if FALSE_COLORS != FALSE_NONE && stored > largest_seen[channel] {
             largest_from[channel] = levels_of[channel];
         }
         largest_seen[channel] = max(largest_seen[channel], stored);
-    } else {
-        let iso = channel_of(channel).iso;
-        let before = sample_before[channel];
-        sample_before[channel] = stored;
-        if stored >= iso {
-            let rise = stored - before;
-            // Between numbers there is nothing: the voxel of an object is its surface.
-            let is_between = rise > 0.0 && before < iso && !has_flag(FLAG_NEAREST);
-            let back = select(0.0, (stored - iso) / rise, is_between);
-            let at = ahead - back * step;
-            if at < hit_at {
-                hit_at = at;
-                surface = channel;
-                surface_at = in_brick(channel, number, along - back * step * way_of(channel, alike));
-            }
+        return;
+    }
+    let iso = channel_of(channel).iso;
+    var before = sample_before[channel];
+    var from_before = beside - beside_before[channel];
+    if before < 0.0 && stored >= iso && !is_first {
+        // What was passed as a whole was not sampled: where it ends says where the surface is.
+        before = stored_at(in_brick(channel, number, along - way, 0.5));
+        from_before = beside + 1.0;
+    }
+    let apart = clamp(from_before, 0.0, 2.0);
+    sample_before[channel] = stored;
+    beside_before[channel] = beside;
+    if stored >= iso {
+        let rise = stored - before;
+        // Between numbers there is nothing: the voxel of an object is its surface.
+        let is_between = rise > 0.0 && before < iso && !is_first && !has_flag(FLAG_NEAREST);
+        let back = select(0.0, (stored - iso) / rise, is_between) * apart;
+        let at = ahead + (beside - back) * step;
+        // Of those that are met at one place the first counts, be they of different levels.
+        if at < hit_at - IN_PLANE * step {
+            hit_at = at;
+            surface = channel;
+            surface_at = in_brick(channel, number, along + (beside - back) * way, 0.0);
+            // What begins where the ray does is cut there.
+            surface_is_cut = is_first;
         }
     }
-    return vec4f(0.0);
+}
+
+// Where the samples of a segment lie where single values count, from its own place [steps].
+struct Places {
+    inner: vec3f,   // front to back, and `NOWHERE`
+    begin: f32,     // where the ray begins, or its level; `NOWHERE` if that is not in the segment
+    end: f32,       // the same of its end
+}
+
+// Places of a segment's samples: its own, and those in planes through voxels' middles that the ray crosses between its own and those of
+// its neighbours. A segment's own sample lies in such a plane, across the axis along which the ray passes most voxels, or half way between
+// two: then those of other axes stand for it, if there are any.
+fn places_of(row: Row, channel: u32, number: f32, along: vec3f, alike: bool) -> Places {
+    // [voxels], per step, and from the middle of one.
+    let way = row.step * way_of(channel, alike) / texel;
+    let most = largest_of(abs(way));
+    let at = in_brick(channel, number, along, 0.0) / texel - 0.5;
+    let is_main = main_axis(way);
+    let from_middle = abs(fract(dot(at, select(vec3f(0.0), vec3f(1.0), is_main)) + 0.5) - 0.5);
+    // Coarser levels that stand in have more than two samples a voxel: each looks half way to its neighbours.
+    let halves = most > 0.49;
+    let is_cut = row.is_cut && number == 0.0;
+    let is_instead = halves && (from_middle > 0.25 || is_cut);
+    let reach = select(0.5, select(0.0, 1.0, is_instead), halves);
+    let looks_back = number == 0.0 && row.look_back <= 0.0;
+    let low = select(-reach, row.look_back, looks_back);
+    let until = row.until - number;
+    let ends = until < 1.0;
+    let high = select(reach, until, ends);
+    // What lies in a plane but for rounding has been met in the one before.
+    let edge = at + (low + IN_PLANE) * way;
+    let plane = select(floor(edge), ceil(edge), way >= vec3f(0.0));
+    let crossed = (plane - at) / divisible(way);
+    let beside = select(vec3f(NOWHERE), crossed, !is_main & (crossed <= vec3f(high)));
+    // In order; of three, that of the main axis is nowhere.
+    let one = min(beside.x, min(beside.y, beside.z));
+    let other = max(min(beside.x, beside.y), min(max(beside.x, beside.y), beside.z));
+    let own = select(0.0, NOWHERE, is_instead && one < NOWHERE);
+    let inner = vec3f(min(one, own), min(max(one, own), other), max(max(one, own), other));
+    let begin = select(NOWHERE, low, looks_back);
+    // Numbers of objects are those of whole voxels, and of steps of several the planes between are none of a picture.
+    let is_plain = has_flag(FLAG_NEAREST) || most > 0.51;
+    return Places(select(inner, vec3f(0.0, NOWHERE, NOWHERE), is_plain), begin, select(NOWHERE, until, ends));
+}
+
+// Takes a channel's samples at the places of a segment where single values count.
+fn keep_samples(row: Row, places: Places, channel: u32, number: f32, along: vec3f, ahead: f32, alike: bool) {
+    beside_before[channel] -= 1.0;
+    let is_start = number == 0.0 && row.is_first;
+    var next = places.inner;
+    for (var n = 0u; n < 3u && next.x < NOWHERE; n += 1u) {
+        keep_at(channel, number, along, ahead, row.step, next.x, is_start && n == 0u, alike);
+        next = vec3f(next.yz, NOWHERE);
+    }
+    // Also where the ray begins and ends, be it within a voxel.
+    if MODE == MODE_MAXIMUM && !has_flag(FLAG_NEAREST) {
+        if places.begin < NOWHERE {
+            keep_at(channel, number, along, ahead, row.step, places.begin, false, alike);
+        }
+        if places.end < NOWHERE {
+            keep_at(channel, number, along, ahead, row.step, places.end, false, alike);
+        }
+    }
 }
 
 // What a ray has seen so far.
@@ -204,6 +284,10 @@ struct Row {
     step: f32,
     halvings: f32,   // of light, in a segment of extinction 1
     is_first: bool,  // of the ray
+    // Where single values count:
+    is_cut: bool,    // whether the ray ends before the plane of its first sample
+    look_back: f32,  // from its first sample, if that is not as for others [steps, negative]
+    until: f32,      // from its first sample, where nothing follows any more [steps]
 }
 
 // Samples a row until no light is left; also, how many samples it took of each channel. What a ray has seen is handed over and back, since
@@ -220,10 +304,19 @@ fn sample_row(row: Row, seen: Seen, alike: bool, taken: ptr<function, f32>) -> S
         var sum = vec4f(0.0);
         hit_at = 3e38;
         if SLOTS == 1u {
-            sum = sampled_at(0u, i, way, ahead, step, true);
+            if IN_PLANES {
+                keep_samples(row, places_of(row, 0u, i, way, true), 0u, i, way, ahead, true);
+            } else {
+                sum = color_at(0u, i, way);
+            }
         } else {
             let along_of_all = along_row + way;
             var rest = row.sampled;
+            // Those of all alike, which rounding would part.
+            var places: Places;
+            if IN_PLANES {
+                places = places_of(row, firstTrailingBit(rest), i, along_of_all, true);
+            }
             for (var n = countOneBits(row.sampled); n > 0u; n -= 1u) {
                 let c = firstTrailingBit(rest);
                 rest &= rest - 1u;
@@ -232,8 +325,15 @@ fn sample_row(row: Row, seen: Seen, alike: bool, taken: ptr<function, f32>) -> S
                     let own = way_of(c, false);
                     along = row.depth * own + ahead * own;
                 }
-                let color = sampled_at(c, i, along, ahead, step, alike);
-                sum += vec4f(color.a * color.rgb, color.a);
+                if IN_PLANES {
+                    if !alike {
+                        places = places_of(row, c, i, along, false);
+                    }
+                    keep_samples(row, places, c, i, along, ahead, alike);
+                } else {
+                    let color = color_at(c, i, along);
+                    sum += vec4f(color.a * color.rgb, color.a);
+                }
             }
         }
         if MODE == MODE_EMISSION_ABSORPTION {
@@ -243,7 +343,6 @@ fn sample_row(row: Row, seen: Seen, alike: bool, taken: ptr<function, f32>) -> S
             transmitted = through;
         }
         if MODE == MODE_ISO_SURFACE && hit_at < 3e38 {
-            surface_is_cut = row.is_first && i == 0.0;
             surface_light = transmitted;
             transmitted = 0.0;
         }
@@ -260,7 +359,9 @@ fn sample_row(row: Row, seen: Seen, alike: bool, taken: ptr<function, f32>) -> S
 fn nothing_before(channels: u32) {
     if MODE == MODE_ISO_SURFACE {
         for (var c = 0u; c < channel_count(); c += 1u) {
-            sample_before[c] = select(sample_before[c], 0.0, ((channels >> c) & 1u) != 0u);
+            let has_none = ((channels >> c) & 1u) != 0u;
+            sample_before[c] = select(sample_before[c], -1.0, has_none);
+            beside_before[c] = select(beside_before[c], 0.0, has_none);
         }
     }
 }

@@ -46,100 +46,255 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
     let ray = view
         .camera
         .ray(pixel.as_dvec2() + 0.5, view.size.as_dvec2());
-    let mut light = [0.0; 3];
-    let mut transmitted = 1.0;
-    let channels: Vec<&Scene> = scene.channels().collect();
-    let mut largest = vec![0.0_f64; channels.len()];
-    let mut before = vec![0.0_f64; channels.len()];
-    if let Some((near, far, face)) = clipped(scene, view, eye, ray) {
-        let mut start = near;
-        while start < far && transmitted > 0.0 {
-            let level = level_at(scene, view, ray, start);
-            let voxel = scene.volume.voxel_nm * scene.volume.levels[level].downsampling;
-            let voxels = ray / voxel;
-            let in_planes = view.mode != Mode::EmissionAbsorption;
-            let half_voxel = 0.5
-                / if in_planes {
-                    voxels.abs().max_element()
-                } else {
-                    voxels.length()
-                };
+    let background = view.background.map(f64::from);
+    let Some((near, far, face)) = clipped(scene, view, eye, ray) else {
+        return background;
+    };
+    let line = Line {
+        eye,
+        ray,
+        near,
+        far,
+    };
+    match view.mode {
+        Mode::EmissionAbsorption => composited(scene, view, &line, cut),
+        Mode::Maximum => {
+            largest(scene, &line.samples(scene, view, cut, true), &line).unwrap_or(background)
+        }
+        Mode::IsoSurface => {
+            let samples = line.samples(scene, view, cut, false);
+            first_surface(scene, &samples, &line, face).unwrap_or(background)
+        }
+    }
+}
+
+/// What a ray passes through.
+struct Line {
+    eye: DVec3,
+    ray: DVec3,
+    near: f64,
+    far: f64,
+}
+
+/// Where single values count: a depth, and the level whose voxels are met there.
+#[derive(Clone, Copy)]
+struct Sample {
+    depth: f64,
+    level: usize,
+}
+
+/// A part of a ray that has one level.
+struct Stretch {
+    begin: f64,
+    end: f64,
+    level: usize,
+    /// Where its segments are sampled.
+    own: Vec<f64>,
+}
+
+impl Line {
+    fn at(&self, depth: f64) -> DVec3 {
+        self.eye + self.ray * depth
+    }
+
+    /// Where the ray is in a level \[voxels\], and how far it goes there per depth.
+    fn in_voxels(&self, scene: &Scene, level: usize) -> (DVec3, DVec3) {
+        let voxel = scene.volume.voxel_nm * scene.volume.levels[level].downsampling;
+        (self.eye / voxel, self.ray / voxel)
+    }
+
+    fn stretches(&self, scene: &Scene, view: &View, cut: Cut) -> Vec<Stretch> {
+        let mut stretches: Vec<Stretch> = Vec::new();
+        let mut start = self.near;
+        while start < self.far {
+            let level = level_at(scene, view, self.ray, start);
+            let (eye, voxels) = self.in_voxels(scene, level);
+            let half_voxel = 0.5 / voxels.abs().max_element();
             let step = match cut {
                 Cut::HalfVoxels => half_voxel,
                 Cut::Fine => half_voxel / 16.0,
             };
-            let end = (start + step).min(far);
-            let mut depth = (start + end) / 2.0;
-            if in_planes && start + step <= far {
-                depth = next_plane(eye / voxel, voxels, start, step);
-            }
-            let at = eye + ray * depth;
-            let mut sum = [0.0; 4];
-            let mut surface: Option<(f64, usize)> = None;
-            for (index, channel) in channels.iter().enumerate() {
-                let stored = interpolated(channel, level, at / voxel);
-                largest[index] = largest[index].max(stored);
-                let iso = stored_iso(channel);
-                if stored >= iso {
-                    let back = (stored - iso) / (stored - before[index]).max(1e-9);
-                    let back = if before[index] < iso { back } else { 0.0 };
-                    let hit = depth - back * step;
-                    if surface.is_none_or(|(other, _)| hit < other) {
-                        surface = Some((hit, index));
-                    }
+            let plane = next_plane(eye, voxels, start, step);
+            let end = (start + step).min(self.far);
+            let own = if plane < self.far {
+                plane
+            } else {
+                (start + end) / 2.0
+            };
+            match stretches.last_mut() {
+                Some(last) if last.level == level => {
+                    last.end = end;
+                    last.own.push(own);
                 }
-                before[index] = stored;
-                let [r, g, b, extinction] = color(channel, stored);
-                for (sum, part) in sum.iter_mut().zip([r, g, b, 1.0]) {
-                    *sum += extinction * part;
-                }
-            }
-            match view.mode {
-                Mode::EmissionAbsorption if sum[3] > 0.0 => {
-                    let opacity = 1.0 - (-sum[3] * (end - start) * ray.length()).exp();
-                    for (light, emitted) in light.iter_mut().zip(sum) {
-                        *light += transmitted * opacity * emitted / sum[3];
-                    }
-                    transmitted *= 1.0 - opacity;
-                }
-                Mode::IsoSurface => {
-                    if let Some((hit, index)) = surface {
-                        // What begins where the ray does is cut there.
-                        let normal = if start == near {
-                            face
-                        } else {
-                            gradient(channels[index], level, eye + ray * hit)
-                        };
-                        light = lit(channels[index], normal, ray);
-                        transmitted = 0.0;
-                    }
-                }
-                Mode::EmissionAbsorption | Mode::Maximum => {}
+                _ => stretches.push(Stretch {
+                    begin: start,
+                    end,
+                    level,
+                    own: vec![own],
+                }),
             }
             start += step;
         }
+        stretches
     }
-    if view.mode == Mode::Maximum && largest.iter().any(|&value| value > 0.0) {
-        for (channel, &value) in channels.iter().zip(&largest) {
-            let [color @ .., _] = if value > 0.0 {
-                color(channel, value)
-            } else {
-                [0.0; 4]
-            };
-            for (light, color) in light.iter_mut().zip(color) {
+
+    /// All samples where single values count, front to back; `with_ends` also where stretches of one level begin and end.
+    fn samples(&self, scene: &Scene, view: &View, cut: Cut, with_ends: bool) -> Vec<Sample> {
+        let mut samples = Vec::new();
+        for stretch in self.stretches(scene, view, cut) {
+            let Stretch {
+                begin,
+                end,
+                level,
+                own,
+            } = stretch;
+            let (eye, voxels) = self.in_voxels(scene, level);
+            let mut depths = own.clone();
+            if matches!(cut, Cut::HalfVoxels) {
+                let main = main_axis(voxels);
+                let crossed = { (0..3).filter(|axis| *axis != main) }
+                    .flat_map(|axis| middles(eye[axis], voxels[axis], begin, end));
+                let crossed: Vec<f64> = crossed.collect();
+                // Half way between two planes the others' stand in.
+                let stands = |(n, depth): (usize, &f64)| {
+                    let whole = eye[main] + voxels[main] * depth - 0.5;
+                    let is_middle = (whole - whole.round()).abs() < 0.25;
+                    let is_last = n + 1 == own.len() && !is_half(whole);
+                    let before = if n == 0 { begin } else { own[n - 1] };
+                    let after = own.get(n + 1).copied().unwrap_or(end);
+                    let is_instead = (!is_middle || is_last) && { crossed.iter() }
+                        .any(|at| (before..=after).contains(at));
+                    (!is_instead).then_some(*depth)
+                };
+                depths = own.iter().enumerate().filter_map(stands).collect();
+                depths.extend(crossed);
+            }
+            if with_ends && matches!(cut, Cut::HalfVoxels) {
+                depths.extend([begin, end]);
+            }
+            depths.sort_by(f64::total_cmp);
+            samples.extend(depths.into_iter().map(|depth| Sample { depth, level }));
+        }
+        samples
+    }
+}
+
+/// Whether a number is a multiple of a half.
+fn is_half(number: f64) -> bool {
+    let twice = number * 2.0;
+    (twice - twice.round()).abs() < 1e-3
+}
+
+/// Depths from `begin` to `end` at which a coordinate is the middle of a voxel.
+fn middles(eye: f64, voxels: f64, begin: f64, end: f64) -> Vec<f64> {
+    if voxels.abs() < 1e-12 {
+        return Vec::new();
+    }
+    let at = |depth: f64| eye + voxels * depth - 0.5;
+    let (low, high) = (at(begin).min(at(end)), at(begin).max(at(end)));
+    let (first, last) = (low.ceil() as i64, high.floor() as i64);
+    (first..=last)
+        .map(|plane| (plane as f64 + 0.5 - eye) / voxels)
+        .collect()
+}
+
+fn main_axis(voxels: DVec3) -> usize {
+    let mut main = 0;
+    for axis in 1..3 {
+        if voxels[axis].abs() > voxels[main].abs() {
+            main = axis;
+        }
+    }
+    main
+}
+
+fn largest(scene: &Scene, samples: &[Sample], line: &Line) -> Option<[f64; 3]> {
+    let mut light = [0.0; 3];
+    let mut is_met = false;
+    for channel in scene.channels() {
+        let values = samples.iter().map(|sample| {
+            let (eye, voxels) = line.in_voxels(scene, sample.level);
+            interpolated(channel, sample.level, eye + voxels * sample.depth)
+        });
+        let value = values.fold(0.0, f64::max);
+        if value > 0.0 {
+            is_met = true;
+            for (light, color) in light.iter_mut().zip(color(channel, value)) {
                 *light += color;
             }
         }
-        return light;
+    }
+    is_met.then_some(light)
+}
+
+fn first_surface(scene: &Scene, samples: &[Sample], line: &Line, face: DVec3) -> Option<[f64; 3]> {
+    let mut first: Option<(f64, &Scene, DVec3)> = None;
+    for channel in scene.channels() {
+        let iso = stored_iso(channel);
+        let mut before: Option<(f64, f64)> = None;
+        for (n, &Sample { depth, level }) in samples.iter().enumerate() {
+            let (eye, voxels) = line.in_voxels(scene, level);
+            let stored = interpolated(channel, level, eye + voxels * depth);
+            if stored < iso {
+                before = Some((depth, stored));
+                continue;
+            }
+            let hit = match before {
+                Some((at, low)) => depth - (depth - at) * (stored - iso) / (stored - low),
+                None => depth,
+            };
+            // What begins where the ray does is cut there.
+            let normal = if n == 0 {
+                face
+            } else {
+                gradient(channel, level, line.at(hit))
+            };
+            if first.is_none_or(|(other, ..)| hit < other) {
+                first = Some((hit, channel, normal));
+            }
+            break;
+        }
+    }
+    let (_, channel, normal) = first?;
+    Some(lit(channel, normal, line.ray))
+}
+
+/// Light that is emitted along a ray, and what is left of the background behind.
+fn composited(scene: &Scene, view: &View, line: &Line, cut: Cut) -> [f64; 3] {
+    let mut light = [0.0; 3];
+    let mut transmitted = 1.0;
+    let mut start = line.near;
+    while start < line.far && transmitted > 0.0 {
+        let level = level_at(scene, view, line.ray, start);
+        let (eye, voxels) = line.in_voxels(scene, level);
+        let step = match cut {
+            Cut::HalfVoxels => 0.5 / voxels.length(),
+            Cut::Fine => 0.5 / voxels.length() / 16.0,
+        };
+        let end = (start + step).min(line.far);
+        let at = eye + voxels * (start + end) / 2.0;
+        let mut sum = [0.0; 4];
+        for channel in scene.channels() {
+            let [r, g, b, extinction] = color(channel, interpolated(channel, level, at));
+            for (sum, part) in sum.iter_mut().zip([r, g, b, 1.0]) {
+                *sum += extinction * part;
+            }
+        }
+        if sum[3] > 0.0 {
+            let opacity = 1.0 - (-sum[3] * (end - start) * line.ray.length()).exp();
+            for (light, emitted) in light.iter_mut().zip(sum) {
+                *light += transmitted * opacity * emitted / sum[3];
+            }
+            transmitted *= 1.0 - opacity;
+        }
+        start += step;
     }
     std::array::from_fn(|c| light[c] + transmitted * f64::from(view.background[c]))
 }
 
 /// Depth, one step after `start` at most, at which a ray is at a whole number of steps from the middles of voxels, along the axis along which it passes most.
 fn next_plane(eye: DVec3, voxels: DVec3, start: f64, step: f64) -> f64 {
-    let axis = (0..3)
-        .max_by(|&a, &b| voxels[a].abs().total_cmp(&voxels[b].abs()))
-        .unwrap();
+    let axis = main_axis(voxels);
     let steps = |depth: f64| (eye[axis] + voxels[axis] * depth - 0.5) / (voxels[axis] * step);
     let here = steps(start);
     // What lies in a plane but for rounding is met in the next.
