@@ -232,7 +232,7 @@ impl Renderer {
         self.wanted
             .retain(|id| views.iter().any(|view| view.channel == id.channel()));
         let with_table = |view: &ChannelView| {
-            let table = TransferTable::new(view, self.volume.dtype, self.mode);
+            let table = TransferTable::new(view, self.volume.dtype, self.volume.kind, self.mode);
             (view.clone(), table)
         };
         self.channels = views.iter().map(with_table).collect();
@@ -281,7 +281,7 @@ impl Renderer {
         if self.mode != mode {
             self.mode = mode;
             for (view, table) in &mut self.channels {
-                *table = TransferTable::new(view, self.volume.dtype, mode);
+                *table = TransferTable::new(view, self.volume.dtype, self.volume.kind, mode);
             }
             self.write_transfer();
         }

@@ -1,7 +1,7 @@
 //! From a transfer function to the table that shaders read, and to what it hides.
 
 use saccade_core::transfer::{OpacityPoint, TABLE_LEN, TransferFunction};
-use saccade_core::volume::{Dtype, Polarity};
+use saccade_core::volume::{Dtype, Polarity, VoxelKind};
 
 use crate::channel::ChannelView;
 use crate::octree::Bins;
@@ -51,7 +51,7 @@ pub(crate) fn bins_of(view: &ChannelView, dtype: Dtype) -> Bins {
 }
 
 impl TransferTable {
-    pub(crate) fn new(view: &ChannelView, dtype: Dtype, mode: Mode) -> Self {
+    pub(crate) fn new(view: &ChannelView, dtype: Dtype, kind: VoxelKind, mode: Mode) -> Self {
         let largest = f64::from(largest(dtype));
         let (first, span) = match dtype {
             Dtype::Uint16 => domain(view, largest, mode),
@@ -76,7 +76,11 @@ impl TransferTable {
         };
         for index in 0..TABLE_LEN {
             let stored = first + index as f64 / scale;
-            // Nothing acquired is nothing seen.
+            // Nothing acquired is nothing seen. No value lies between that and an object's number, however many share an entry.
+            let stored = match kind {
+                VoxelKind::Labels => stored.max(1.0),
+                _ => stored,
+            };
             let nothing = stored < 0.5;
             let value = if nothing {
                 0.0
@@ -210,7 +214,7 @@ mod tests {
     }
 
     fn table(view: &ChannelView, dtype: Dtype) -> TransferTable {
-        TransferTable::new(view, dtype, Mode::EmissionAbsorption)
+        TransferTable::new(view, dtype, VoxelKind::Intensity, Mode::EmissionAbsorption)
     }
 
     #[test]
@@ -269,7 +273,7 @@ mod tests {
             view.iso = at(30_000.0);
             // 1200 values on 255 steps between entries.
             let spacing = |view: &ChannelView, mode| {
-                let table = TransferTable::new(view, Dtype::Uint16, mode);
+                let table = TransferTable::new(view, Dtype::Uint16, VoxelKind::Intensity, mode);
                 1.0 / f64::from(table.scale)
             };
             for mode in [Mode::EmissionAbsorption, Mode::Maximum] {
@@ -316,6 +320,34 @@ mod tests {
         }
     }
 
+    /// However far apart the entries are that the largest number leaves to the small ones.
+    #[test]
+    fn objects_of_small_numbers_are_as_opaque_as_those_of_large_ones() {
+        let largest = 65_535.0;
+        for most in [2.0_f32, 300.0, 4000.0, largest] {
+            let points = [(0.0, 0.0), (1.0 / largest, 0.85)];
+            let view = view(Polarity::Bright, &points, [0.0, most / largest]);
+            let of =
+                |kind| TransferTable::new(&view, Dtype::Uint16, kind, Mode::EmissionAbsorption);
+            let table = of(VoxelKind::Labels);
+            let extinction_of = |table: &TransferTable, number: f32| {
+                let x = (number * table.scale + table.offset).clamp(0.0, 255.0);
+                let low = x.floor().min(254.0);
+                let [a, b] = [low, low + 1.0].map(|i| table.colors[i as usize][3]);
+                a + (x - low) * (b - a)
+            };
+            let want = extinction(&view.transfer, 0.5) as f32;
+            for number in [1.0, 2.0, 10.0, 100.0, 299.0, most] {
+                let got = extinction_of(&table, number);
+                assert!((got - want).abs() < 1e-6, "{number} of {most}: {got}");
+            }
+            assert!(table.hides(0, 0) && !table.hides(0, 1) && !table.hides(1, 1));
+            // Where values are shades, those near nothing fade.
+            let got = extinction_of(&of(VoxelKind::Intensity), 1.0);
+            assert!(most < 1000.0 || got < 0.5 * want, "{most}: {got}");
+        }
+    }
+
     #[test]
     fn what_is_hidden_is_transparent_everywhere() {
         let at = |counts: f32| counts / 65_535.0;
@@ -334,7 +366,8 @@ mod tests {
         for (dtype, largest) in [(Dtype::Uint8, 255.0_f32), (Dtype::Uint16, 65_535.0)] {
             for polarity in [Polarity::Bright, Polarity::Dark] {
                 let view = view(polarity, &[(0.0, 1.0)], [0.0, 1.0]);
-                let table = TransferTable::new(&view, dtype, Mode::IsoSurface);
+                let table =
+                    TransferTable::new(&view, dtype, VoxelKind::Intensity, Mode::IsoSurface);
                 let iso = (table.iso * largest).round() as u16;
                 let step = (largest / 100.0).ceil() as u16;
                 assert!(table.hides(0, iso - step), "{dtype:?} {polarity:?}");

@@ -189,7 +189,8 @@ impl Histogram {
         let point = |value, opacity| OpacityPoint { value, opacity };
         TransferFunction {
             polarity: Polarity::Bright,
-            color_map: ColorMap::Gray,
+            // Not from black, where small numbers beside large ones could not be seen.
+            color_map: ColorMap::Viridis,
             window: [0.0, high.max(2.0 / largest)],
             opacity: vec![point(0.0, 0.0), point(1.0 / largest, 0.85)],
             opacity_length_nm: (longest / 64.0).min(shortest / 2.0),
@@ -223,6 +224,8 @@ mod tests {
                 assert_eq!(opacity(number), opacity(201));
                 assert!(opacity(number) > 0.8);
             }
+            // Small ones are seen beside large ones as well.
+            assert!(tf.color_at(1.0 / largest).into_iter().fold(0.0, f32::max) > 0.05);
             let [least, most] = tf.window.map(|v| v * largest);
             assert!(least == 0.0 && (most - 201.0).abs() < 0.01);
         }
