@@ -224,7 +224,9 @@ pub(super) fn quarantined(row: &Row) -> Result<Quarantined, Error> {
         reason: legible(row, "reason"),
         bytes: bytes.map(i64::unsigned_abs),
         at: time(row, "at").unwrap_or(UNIX_EPOCH),
-        awaited: unsigned(row, "awaited").ok(),
+        // Of no number SQLite makes 0, which is a record's place.
+        awaited: { row.get::<Option<i64>>("awaited").ok().flatten() }
+            .and_then(|at| u64::try_from(at).ok()),
     })
 }
 

@@ -379,7 +379,7 @@ pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
         awaited: Some(position),
         ..broken("b")
     };
-    for position in [2, 3, 4, 9] {
+    for position in [2, 3, 40, 90] {
         catalog.quarantine("v", &awaited(position)).await.unwrap();
     }
     // A good record ends the quarantine of its tile, and only of that, and of no image that was announced later.
@@ -392,7 +392,7 @@ pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
         .commit_tile("v", &tile("b", 0, at(0.0, 0.0), 3))
         .await
         .unwrap();
-    let late = [4, 9].map(awaited);
+    let late = [40, 90].map(awaited);
     assert_eq!(catalog.quarantined("v").await.unwrap(), late);
     assert_eq!(catalog.first_quarantined("v", 1).await.unwrap(), late[..1]);
     // One that somebody deletes who knows of no records goes before the first of them.
@@ -400,12 +400,12 @@ pub(crate) async fn a_commit_happens_whole_or_not_at_all(place: &Place) {
     let deleted = commit.delete_seen("b", 700, SystemTime::now()).await;
     assert_eq!(deleted.unwrap(), DeleteOutcome::Deleted);
     commit
-        .take_up(&waiting("b", 0, at(0.0, 0.0), 4))
+        .take_up(&waiting("b", 0, at(0.0, 0.0), 40))
         .await
         .unwrap();
     commit.finish().await.unwrap();
-    assert_eq!(catalog.quarantined("v").await.unwrap(), [awaited(9)]);
-    for (position, outcome) in [(3, TileOutcome::Superseded), (4, TileOutcome::New)] {
+    assert_eq!(catalog.quarantined("v").await.unwrap(), [awaited(90)]);
+    for (position, outcome) in [(3, TileOutcome::Superseded), (40, TileOutcome::New)] {
         let tile = tile("b", 0, at(0.0, 0.0), position);
         let entered = catalog.commit_tile("v", &tile).await;
         assert_eq!(entered.unwrap(), outcome);

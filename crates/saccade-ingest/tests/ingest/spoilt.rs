@@ -258,7 +258,7 @@ async fn what_waits_and_cannot_be_understood_is_set_aside() {
 #[tokio::test]
 async fn what_can_be_read_of_the_quarantine_is_told() {
     let (scope, _folder, archive) = three().await;
-    let spoilt = "INSERT INTO quarantine VALUES \
+    let spoilt = "INSERT INTO quarantine (id, volume, file, tile, reason, bytes, at) VALUES \
                   (1, 1, CAST(x'61ff' AS TEXT), 't0', CAST(x'fe62' AS TEXT), -4, -9)";
     meddle(&archive, spoilt.into()).await;
     let told = archive
