@@ -160,6 +160,7 @@ pub async fn check(
         named: HashSet::new(),
         shared: HashSet::new(),
         lacks_index: !pending.is_empty(),
+        undecided: HashSet::new(),
         given_back: HashSet::new(),
         unknown: HashSet::new(),
         known: volumes.iter().map(|volume| volume.name.clone()).collect(),
@@ -234,6 +235,8 @@ struct Check<'a> {
     shared: HashSet<String>,
     /// Whether the catalog lacks an index, so that rows may have one name.
     lacks_index: bool,
+    /// Rows of the volume at hand that have one name, where nothing tells whose it is.
+    undecided: HashSet<TileId>,
     /// Volume and name of tiles that were given back for that.
     given_back: HashSet<(String, String)>,
     /// Volumes of whose tiles nothing is known.
@@ -486,6 +489,9 @@ impl Check<'_> {
         tile: &Tile,
         looked: Result<(Verified, u64), PyramidError>,
     ) -> Result<(), CheckError> {
+        if self.is_undecided(tile.id, Some(&tile.name), &tile.pyramid) {
+            return Ok(());
+        }
         let known = (entry.volume.name.clone(), tile.name.clone());
         if self.given_back.contains(&known) {
             return Ok(());

@@ -3,7 +3,7 @@
 use saccade_core::voxel_box::VoxelBox;
 
 use super::database::Row;
-use super::{Catalog, CatalogError, TileId, rows};
+use super::{Catalog, CatalogError, Tile, TileId, rows};
 
 /// Which records say what a tile is.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -45,7 +45,7 @@ pub struct Naming {
 }
 
 /// A row that has a name which another has as well.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct NamedRow {
     /// Its id.
     pub id: TileId,
@@ -57,6 +57,10 @@ pub struct NamedRow {
     pub position: Option<u64>,
     /// Name of its pyramid.
     pub pyramid: String,
+    /// Whether it is called deleted.
+    pub deleted: bool,
+    /// What it says of its tile, if that can be, whatever its pyramid is called.
+    pub tile: Option<Tile>,
 }
 
 /// The row that has a tile's name.
@@ -187,7 +191,8 @@ impl Catalog {
     /// [`CatalogError::UnknownVolume`], or what the database says.
     pub async fn rows_of_one_name(&self, volume: &str) -> Result<Vec<NamedRow>, CatalogError> {
         let id = self.volume_id(volume).await?;
-        let question = "SELECT id, name, section, position, pyramid FROM tiles WHERE volume = $1 AND name IN \
+        let question = "SELECT id, name, section, channel, width, height, a, b, c, d, tx, ty, \
+                        pyramid, revision, position, deleted FROM tiles WHERE volume = $1 AND name IN \
                         (SELECT name FROM tiles WHERE volume = $1 GROUP BY name HAVING count(*) > 1) ORDER BY id";
         let named = |row: &Row| {
             Ok(NamedRow {
@@ -196,6 +201,8 @@ impl Catalog {
                 section: rows::section(row).ok(),
                 position: rows::unsigned(row, "position").ok(),
                 pyramid: rows::legible(row, "pyramid"),
+                deleted: row.get::<i64>("deleted")? != 0,
+                tile: rows::tile_but_for_pyramid(row),
             })
         };
         self.ask(question, &[id.into()], named).await

@@ -166,6 +166,11 @@ pub(super) fn tile_whose_records_are_known(row: &Row) -> Result<Result<Tile, Spo
     }
 }
 
+/// What a row says of its tile, whatever it says of its pyramid.
+pub(super) fn tile_but_for_pyramid(row: &Row) -> Option<Tile> {
+    tile_with(row, legible(row, "pyramid"), transform(row).ok()?).ok()
+}
+
 fn tile(row: &Row) -> Result<Tile, Error> {
     tile_with(row, pyramid(row)?, transform(row)?)
 }

@@ -30,6 +30,10 @@ impl Check<'_> {
                 self.named.insert(self.hasher.hash_one(pyramid));
             }
             let id = row.as_ref().map_or_else(|spoilt| spoilt.id, |tile| tile.id);
+            let called = name.map(String::as_str);
+            if self.is_undecided(id, called, pyramid.map_or("", String::as_str)) {
+                continue;
+            }
             let is_told = name.is_some_and(|name| self.is_told_deleted(name));
             let is_known = !is_told && self.history.was_deleted(id, 0);
             if is_told || is_known {

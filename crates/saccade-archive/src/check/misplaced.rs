@@ -65,6 +65,10 @@ impl Check<'_> {
         entry: &VolumeEntry,
         tile: SpoiltTile,
     ) -> Result<(), CheckError> {
+        let (Ok(pyramid) | Err(pyramid)) = &tile.pyramid;
+        if self.is_undecided(tile.id, tile.name.as_deref().ok(), pyramid) {
+            return Ok(());
+        }
         if let Ok(name) = &tile.name
             && self.history.was_deleted(tile.id, 0)
             && tile.pyramid.as_ref().is_err_and(String::is_empty)

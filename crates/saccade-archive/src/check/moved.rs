@@ -136,6 +136,24 @@ impl Check<'_> {
         Ok(tile)
     }
 
+    /// Whether nothing explains that a row's tile lies elsewhere than its newest record says.
+    pub(super) async fn lies_wrongly(
+        &self,
+        entry: &VolumeEntry,
+        tile: &Tile,
+    ) -> Result<bool, CheckError> {
+        let records = self.records.as_ref();
+        let Some((records, said)) =
+            records.and_then(|records| Some((records, records.elsewhere(tile)?)))
+        else {
+            return Ok(false);
+        };
+        let placing = { self.archive.catalog() }.placing(&entry.volume.name, tile.id);
+        let placing = placing.await?;
+        let shaped = records.shaped(tile);
+        Ok(placing.is_some_and(|now| self.its_place(entry, &shaped, said, &now).is_some()))
+    }
+
     /// Where a tile belongs that lies elsewhere than a record said, and why, if nothing explains that.
     fn its_place(
         &self,

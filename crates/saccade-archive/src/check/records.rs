@@ -56,6 +56,16 @@ struct Image {
     channel: Option<u32>,
 }
 
+impl Image {
+    fn of(tile: &Tile) -> Self {
+        Self {
+            section: tile.section,
+            size: tile.size,
+            channel: Some(tile.channel),
+        }
+    }
+}
+
 impl Records {
     /// Those of a volume up to `read`, if they are what was read.
     fn read(folder: &Path, read: Cursor, volume: &Volume, hasher: Keyed) -> Option<Self> {
@@ -171,6 +181,13 @@ impl Records {
         self.newest.contains_key(&self.hasher.hash_one(tile))
     }
 
+    /// Whether a row that has a tile's name is of the section, the size and the channel that its newest record says.
+    pub(super) fn has_shape(&self, tile: &Tile) -> bool {
+        let newest = self.newest.get(&self.hasher.hash_one(&tile.name));
+        let image = newest.and_then(|newest| newest.image);
+        image == Some(Image::of(tile))
+    }
+
     /// The position of the newest record of a tile's image, or of its end.
     pub(super) fn position_of(&self, tile: &str) -> Option<u64> {
         let newest = self.newest.get(&self.hasher.hash_one(tile))?;
@@ -209,11 +226,7 @@ impl Records {
             return None;
         }
         let image = newest.image?;
-        let has = Image {
-            section: tile.section,
-            size: tile.size,
-            channel: Some(tile.channel),
-        };
+        let has = Image::of(tile);
         let shape = |of: Image| {
             let channel = of
                 .channel

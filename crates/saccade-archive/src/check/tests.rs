@@ -13,6 +13,7 @@ use crate::pyramid::{Encoding, encode};
 
 mod audit;
 mod called;
+mod doubled;
 mod meanwhile;
 mod meddled;
 mod rows;

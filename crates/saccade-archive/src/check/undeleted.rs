@@ -13,6 +13,9 @@ impl Check<'_> {
         while let Some((last, rows)) = catalog.deleted_after(volume, after).await? {
             after = last;
             for (mut tile, position) in rows {
+                if self.is_undecided(tile.id, Some(&tile.name), &tile.pyramid) {
+                    continue;
+                }
                 if let Some(name) = self.called.get(&tile.id) {
                     tile.name.clone_from(name);
                 }

@@ -33,7 +33,7 @@ impl Fixture {
         }
     }
 
-    async fn repair(&self, with_records: bool) -> CheckReport {
+    pub(super) async fn repair(&self, with_records: bool) -> CheckReport {
         let options = CheckOptions {
             repair: true,
             safe_age: Duration::ZERO,
@@ -43,7 +43,7 @@ impl Fixture {
         check(&self.archive, &options, &|_, _| {}).await.unwrap()
     }
 
-    fn has_all(&self) -> bool {
+    pub(super) fn has_all(&self) -> bool {
         (0..6).all(|n| self.path(n).is_file())
     }
 }
@@ -154,76 +154,4 @@ async fn an_index_that_is_another_one_is_made_anew() {
     let repaired = fixture.repair(false).await;
     assert_eq!(repaired.findings[0].repair, Some(Repair::Reindexed));
     assert_eq!(fixture.check(false).await.findings, []);
-}
-
-/// What the index would have refused is mended first.
-#[tokio::test]
-async fn a_name_that_two_rows_have_keeps_its_index_from_being_made() {
-    let fixture = Fixture::new().await;
-    let twice = "UPDATE tiles SET name = 't1' WHERE name = 't0'";
-    fixture.meddle(&["DROP INDEX tiles_by_name", twice]).await;
-    // Nothing tells whose it is.
-    let without = fixture.repair(false).await;
-    let index = &without.findings[0];
-    assert_eq!((index.kind, index.repair), (FindingKind::Unsound, None));
-    assert!(
-        index.reason.contains("two rows have one name") && index.reason.contains("--acquisition"),
-        "{}",
-        index.reason
-    );
-    let repaired = fixture.repair(true).await;
-    assert_eq!(repaired.findings[0].repair, Some(Repair::Reindexed));
-    assert!(fixture.has_all());
-    fixture.has_each_once().await;
-}
-
-/// Whatever somebody wrote into them; the one that is the tile's stays, be it not the first.
-#[tokio::test]
-async fn of_rows_of_one_name_the_one_of_its_record_is_kept() {
-    const COLUMNS: &str = "section, channel, width, height, a, b, c, d, tx, ty, revision, transform_position, deleted";
-    for (which, pyramid, position) in [
-        // The same once more, another's image, an image of none.
-        ("t0", "pyramid", "position"),
-        ("t1", "pyramid", "position"),
-        ("t0", "'tiles/none'", "0"),
-        ("t1", "pyramid", "999999999"),
-    ] {
-        for original_is_last in [false, true] {
-            let fixture = Fixture::new().await;
-            let copy = format!(
-                "INSERT INTO tiles (volume, name, pyramid, position, {COLUMNS}) \
-                 SELECT volume, 't0', {pyramid}, {position}, {COLUMNS} FROM tiles WHERE name = '{which}'"
-            );
-            let last = "UPDATE tiles SET id = (SELECT max(id) + 1 FROM tiles) \
-                        WHERE id = (SELECT min(id) FROM tiles WHERE name = 't0')";
-            let mut meddle = vec!["DROP INDEX tiles_by_name", &copy];
-            meddle.extend(original_is_last.then_some(last));
-            fixture.meddle(&meddle).await;
-            let what = format!("{which} {pyramid} {position} {original_is_last}");
-            let told = fixture.look(false).await;
-            let reasons: Vec<_> = told.findings.iter().map(|f| &f.reason).collect();
-            assert!(
-                { reasons.iter() }.any(|reason| reason.contains("another row has its name")),
-                "{what}: {reasons:?}"
-            );
-            let repaired = fixture.repair(true).await;
-            assert_eq!(repaired.damage(), 0, "{what}: {:?}", repaired.findings);
-            assert!(fixture.has_all(), "{what}");
-            fixture.has_each_once().await;
-        }
-    }
-}
-
-impl Fixture {
-    /// All are there, once, with their own pyramids, and nothing is found.
-    async fn has_each_once(&self) {
-        let catalog = self.archive.catalog();
-        assert_eq!(catalog.lacking_indexes().await.unwrap(), [""; 0]);
-        assert_eq!(self.check(true).await.findings, []);
-        for n in 0..TILES {
-            let name = format!("t{n}");
-            let tile = catalog.tile(VOLUME, &name).await.unwrap().unwrap();
-            assert!(tile.pyramid.contains(&name), "{name}: {}", tile.pyramid);
-        }
-    }
 }
