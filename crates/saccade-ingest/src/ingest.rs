@@ -20,6 +20,7 @@
 
 mod absent;
 mod away;
+mod begin;
 mod earlier;
 mod enter;
 mod error;

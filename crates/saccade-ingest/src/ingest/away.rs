@@ -6,8 +6,8 @@ use saccade_archive::VisualizationArchive;
 use saccade_archive::catalog::{CatalogError, Worker};
 
 use super::IngestOptions;
+use super::begin::worker_name;
 use super::process;
-use super::run::worker_name;
 use crate::Cancel;
 
 /// Between looks.

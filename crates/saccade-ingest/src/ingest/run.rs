@@ -10,18 +10,18 @@ use futures::TryStreamExt;
 use futures::future::{Either, select};
 use futures::stream::FuturesUnordered;
 use saccade_archive::VisualizationArchive;
-use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
+use saccade_archive::acquisition::RecordReader;
 use saccade_archive::catalog::{CatalogError, Waiting, Worker};
 use saccade_archive::clock::Clock;
 use saccade_archive::storage::StorageError;
 use tokio::sync::mpsc;
 
+use super::begin::{Begun, begin};
 use super::earlier::Earlier;
-use super::enter::{COMMIT_AT_ONCE, Enter, SetAside, retry};
+use super::enter::{COMMIT_AT_ONCE, Enter, SetAside};
 use super::images::Images;
 use super::prepare::{Context, Stored};
 use super::reasons::{self, Called};
-use super::records::patiently;
 use super::supply::{Job, Supply};
 use super::waiting::WaitingRoom;
 use super::{IngestError, IngestOptions, process};
@@ -82,34 +82,27 @@ pub async fn run(
         clock: archive.catalog().clock(),
     };
     let progress: &dyn Progress = &heard;
-    let volume = AcquisitionInfo::read_volume(acquisition, options.volume.as_deref())?;
     let catalog = archive.catalog();
     let clock = catalog.clock();
-    retry(clock, options, progress, || catalog.create_volume(&volume)).await?;
-    // Before anything is worked on: what is in the queue may be of another acquisition.
-    let cursor = retry(clock, options, progress, || catalog.cursor(&volume.name)).await?;
-    let mut reader = RecordReader::new(acquisition, cursor);
-    let known = patiently(clock, options, progress, || reader.recognize()).await?;
-    if known != cursor {
-        let learn = async || {
-            let mut commit = catalog.begin(&volume.name).await?;
-            // If another has read on, it has learned it as well.
-            commit.advance(cursor, known).await?;
-            commit.finish().await
-        };
-        retry(clock, options, progress, learn).await?;
-    }
+    let begun = {
+        let begin = pin!(begin(acquisition, archive, options, progress));
+        match select(begin, pin!(cancel.cancelled())).await {
+            Either::Left((begun, _)) => begun?,
+            // Whoever it says is at work is gone, as others find.
+            Either::Right(_) => return Ok(Summary::default()),
+        }
+    };
+    let Begun {
+        volume,
+        reader,
+        earlier,
+        worker,
+    } = begun;
     let (stored, why) = Stored::new(volume.dtype, volume.kind, options.encoding);
     if let Some(why) = why {
         progress.notice(why);
     }
     let images = Images::new(acquisition, options.linked.as_deref());
-    let set_aside = || catalog.quarantined(&volume.name);
-    let set_aside = retry(clock, options, progress, set_aside).await?;
-    let earlier = Earlier::new(acquisition, cursor, &set_aside);
-    let (name, process) = (worker_name(), process::this().unwrap_or_default());
-    let register = || catalog.register_process(&name, &process, options.lease);
-    let worker = retry(clock, options, progress, register).await?;
     let called = called(acquisition, archive, options);
     let mut ingest = Ingest {
         archive,
@@ -189,12 +182,6 @@ fn called(acquisition: &Path, archive: &VisualizationArchive, options: &IngestOp
         }
     }
     called
-}
-
-/// What people call this worker.
-pub(super) fn worker_name() -> String {
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    format!("{}:{}", host.trim(), std::process::id())
 }
 
 /// Gives signs of life, until dropped. Without them, others take over: that is what they are for. Those of this

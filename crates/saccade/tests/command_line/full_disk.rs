@@ -31,6 +31,15 @@ if [ "$4" = OPEN ]; then
   "$1" ingest "$2" "$3/archive" --once --lossless 2> "$5/first"
   cat /dev/zero > "$3/ballast" 2> "$5/full" || true
   grep -q 'No space left' "$5/full"
+  # Who is told to end does not wait for room.
+  "$1" ingest "$2" "$3/archive" --lossless 2> "$5/early" &
+  early=$!
+  until_said 'no space is left for the catalog' "$5/early"
+  kill -TERM $early
+  (sleep 20; kill -KILL $early) &
+  guard=$!
+  wait $early
+  kill $guard
   "$1" ingest "$2" "$3/archive" --once --lossless 2> "$5/log" &
   ingest=$!
   until_said 'no space is left for the catalog' "$5/log"
