@@ -254,19 +254,20 @@ fn places_of(row: Row, channel: u32, number: f32, along: vec3f, alike: bool) -> 
 fn keep_samples(row: Row, places: Places, channel: u32, number: f32, along: vec3f, ahead: f32, alike: bool) {
     beside_before[channel] -= 1.0;
     let is_start = number == 0.0 && row.is_first;
+    // Also where the ray begins and ends, be it within a voxel.
+    let has_ends = !has_flag(FLAG_NEAREST);
+    let begins = has_ends && places.begin < NOWHERE;
+    if begins {
+        keep_at(channel, number, along, ahead, row.step, places.begin, is_start, alike);
+    }
     var next = places.inner;
     for (var n = 0u; n < 3u && next.x < NOWHERE; n += 1u) {
-        keep_at(channel, number, along, ahead, row.step, next.x, is_start && n == 0u, alike);
+        let is_first = is_start && n == 0u && !begins;
+        keep_at(channel, number, along, ahead, row.step, next.x, is_first, alike);
         next = vec3f(next.yz, NOWHERE);
     }
-    // Also where the ray begins and ends, be it within a voxel.
-    if MODE == MODE_MAXIMUM && !has_flag(FLAG_NEAREST) {
-        if places.begin < NOWHERE {
-            keep_at(channel, number, along, ahead, row.step, places.begin, false, alike);
-        }
-        if places.end < NOWHERE {
-            keep_at(channel, number, along, ahead, row.step, places.end, false, alike);
-        }
+    if has_ends && places.end < NOWHERE {
+        keep_at(channel, number, along, ahead, row.step, places.end, false, alike);
     }
 }
 

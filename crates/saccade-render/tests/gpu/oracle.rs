@@ -59,10 +59,10 @@ fn trace(scene: &Scene, view: &View, pixel: UVec2, cut: Cut) -> [f64; 3] {
     match view.mode {
         Mode::EmissionAbsorption => composited(scene, view, &line, cut),
         Mode::Maximum => {
-            largest(scene, &line.samples(scene, view, cut, true), &line).unwrap_or(background)
+            largest(scene, &line.samples(scene, view, cut), &line).unwrap_or(background)
         }
         Mode::IsoSurface => {
-            let samples = line.samples(scene, view, cut, false);
+            let samples = line.samples(scene, view, cut);
             first_surface(scene, &samples, &line, face).unwrap_or(background)
         }
     }
@@ -138,8 +138,8 @@ impl Line {
         stretches
     }
 
-    /// All samples where single values count, front to back; `with_ends` also where stretches of one level begin and end.
-    fn samples(&self, scene: &Scene, view: &View, cut: Cut, with_ends: bool) -> Vec<Sample> {
+    /// All samples where single values count, front to back, also where stretches of one level begin and end.
+    fn samples(&self, scene: &Scene, view: &View, cut: Cut) -> Vec<Sample> {
         let mut samples = Vec::new();
         for stretch in self.stretches(scene, view, cut) {
             let Stretch {
@@ -169,7 +169,7 @@ impl Line {
                 depths = own.iter().enumerate().filter_map(stands).collect();
                 depths.extend(crossed);
             }
-            if with_ends && matches!(cut, Cut::HalfVoxels) {
+            if matches!(cut, Cut::HalfVoxels) {
                 depths.extend([begin, end]);
             }
             depths.sort_by(f64::total_cmp);

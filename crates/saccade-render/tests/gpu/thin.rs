@@ -5,7 +5,7 @@ use saccade_core::camera::Camera;
 use saccade_core::space::Point;
 use saccade_core::transfer::{ColorMap, TransferFunction};
 use saccade_core::volume::Polarity;
-use saccade_render::{Clip, Gpu, Image, Mode, Renderer, RendererOptions, Slab, View};
+use saccade_render::{Clip, Gpu, HalfSpace, Image, Mode, Renderer, RendererOptions, Slab, View};
 
 use crate::harness::{gpu, keep, read, settle};
 use crate::oracle::encoded;
@@ -124,6 +124,65 @@ fn a_sheet_has_a_surface_from_all_sides() {
     let view = view(Mode::IsoSurface, 0.0, 0.0, 8.0, UVec2::new(31, 23));
     let seen = picture(&gpu, &none, &view);
     assert!({ seen.rgba.chunks_exact(4) }.all(|pixel| pixel[0] == 0));
+}
+
+/// What is cut within a sheet is closed there, from either side, and wherever no value is so high it is open.
+#[test]
+fn a_sheet_that_is_cut_has_no_holes() {
+    let Some(gpu) = gpu() else { return };
+    for axis in 0..3 {
+        let mut scene = scene(|at| if at[axis] == EDGE / 2 { BRIGHT } else { 1 });
+        let middle = f64::from(EDGE) / 2.0;
+        // Interpolated, half of it is left half a voxel beside the middle.
+        for (beside, share) in [
+            (0.0, 0.9),
+            (0.25, 0.7),
+            (0.5, 0.4),
+            (-0.25, 0.7),
+            (-0.5, 0.4),
+        ] {
+            let mut point = DVec3::splat(middle);
+            point[axis] += beside;
+            for side in [1.0, -1.0] {
+                let half = HalfSpace {
+                    point: Point::new(point * VOXEL),
+                    normal: DVec3::AXES[axis] * side,
+                };
+                let clip = Clip {
+                    half_spaces: [Some(half), None, None, None],
+                    ..Clip::default()
+                };
+                for (yaw, pitch) in [
+                    (0.0, 0.0),
+                    (35.0, 25.0),
+                    (200.0, -30.0),
+                    (90.0, 0.0),
+                    (10.0, 89.0),
+                ] {
+                    let view = View {
+                        clip,
+                        ..view(Mode::IsoSurface, yaw, pitch, 8.0, UVec2::new(21, 15))
+                    };
+                    if direction(&view)[axis].abs() < 0.3 {
+                        continue;
+                    }
+                    let what = format!("axis {axis} from {yaw}, {pitch}: {beside}, {side}");
+                    let open = |scene: &Scene| {
+                        let seen = picture(&gpu, scene, &view);
+                        { seen.rgba.chunks_exact(4) }
+                            .filter(|pixel| pixel[0] == 0)
+                            .count()
+                    };
+                    scene.iso = f64::from(BRIGHT) * share;
+                    assert_eq!(open(&scene), 0, "{what}");
+                    // Only what lies behind the cut has the sheet's middle.
+                    let has_middle = beside * side <= 0.0;
+                    scene.iso = f64::from(BRIGHT) * if has_middle { 1.02 } else { share + 0.15 };
+                    assert_eq!(open(&scene), 21 * 15, "{what}");
+                }
+            }
+        }
+    }
 }
 
 /// As the largest voxel of each column is, and not what lies between two.
