@@ -6,6 +6,8 @@
 use std::collections::BTreeMap;
 use std::hash::BuildHasher as _;
 
+use saccade_core::voxel_box::VoxelBox;
+
 use super::names::Name;
 use super::{Check, CheckError, Finding, FindingKind, Repair};
 use crate::acquisition::Record;
@@ -131,7 +133,14 @@ impl Check<'_> {
             ChangeReason::Tile | ChangeReason::Transform => {
                 let extent = entry.volume.extent();
                 let lies = place(extent, tile.section, tile.size, tile.transform);
-                !row.deleted && lies.is_some_and(|lies| change.voxels.intersection(lies) == lies)
+                // A move led away from where the tile was before.
+                let led_to = |lies: VoxelBox| match last.before {
+                    Some(before) if change.reason == ChangeReason::Transform => {
+                        before.intersection(change.voxels).union(lies) == change.voxels
+                    }
+                    _ => change.voxels.intersection(lies) == lies,
+                };
+                !row.deleted && lies.is_some_and(led_to)
             }
         }
     }

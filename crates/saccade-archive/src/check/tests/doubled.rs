@@ -153,18 +153,27 @@ async fn of_a_tile_that_was_deleted_the_row_that_says_so_is_kept() {
 /// What cannot be known is left, and told.
 #[tokio::test]
 async fn of_rows_of_which_nothing_tells_none_is_taken_away() {
+    for is_exchanged in [false, true] {
+        nothing_tells(is_exchanged).await;
+    }
+}
+
+/// The row that was moved has another id; the copy, which lies where the record says, has one of its own or that one's.
+async fn nothing_tells(is_exchanged: bool) {
     let fixture = Fixture::new().await;
     let to = SectionFromTile::translation(DVec2::splat(90.0));
     let catalog = fixture.archive.catalog();
     catalog.set_transform(VOLUME, "t2", to).await.unwrap();
     let copy = copied(false, "3.0, 3.0", "0");
-    fixture
-        .meddle(&[
-            "DROP INDEX tiles_by_name",
-            &copy,
-            "UPDATE tiles SET id = (SELECT max(id) + 1 FROM tiles) WHERE name = 't2' AND tx = 90",
-        ])
-        .await;
+    let id = catalog.tile(VOLUME, "t2").await.unwrap().unwrap().id.0;
+    let taken = format!("UPDATE tiles SET id = {id} WHERE name = 't2' AND tx = 3");
+    let mut meddle = vec![
+        "DROP INDEX tiles_by_name",
+        &copy,
+        "UPDATE tiles SET id = (SELECT max(id) + 1 FROM tiles) WHERE name = 't2' AND tx = 90",
+    ];
+    meddle.extend(is_exchanged.then_some(&*taken));
+    fixture.meddle(&meddle).await;
     for with_records in [true, false, true] {
         let report = fixture.repair(with_records).await;
         assert!(report.damage() > 0, "{:?}", report.findings);
