@@ -201,7 +201,7 @@ impl Catalog {
                 section: rows::section(row).ok(),
                 position: rows::unsigned(row, "position").ok(),
                 pyramid: rows::legible(row, "pyramid"),
-                deleted: row.get::<i64>("deleted")? != 0,
+                deleted: row.get::<i64>("deleted").is_ok_and(|deleted| deleted != 0),
                 tile: rows::tile_but_for_pyramid(row),
             })
         };

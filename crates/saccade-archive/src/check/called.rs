@@ -135,7 +135,7 @@ impl Check<'_> {
     }
 
     /// Calls a tile as its pyramid has it, or tells that; the tile so.
-    async fn call(
+    pub(super) async fn call(
         &mut self,
         entry: &VolumeEntry,
         listed: &Tile,

@@ -200,23 +200,10 @@ impl Check<'_> {
         row: &NamedRow,
         of: &str,
     ) -> Result<(), CheckError> {
-        let own = Name::of(&row.pyramid);
-        let Some(tile) =
-            { row.tile.as_ref() }.filter(|_| own.is_some_and(|own| own.is_after(&row.name)))
-        else {
-            return Ok(());
-        };
-        let mut reason = format!("its row is of tile {of}, which the catalog lacks");
-        let mut repair = None;
-        if self.options.repair {
-            let mut commit = self.archive.catalog().begin(&entry.volume.name).await?;
-            commit.rename(tile, of).await?;
-            commit.finish().await?;
-            repair = Some(Repair::Renamed);
-        } else {
-            reason.push_str(": `saccade check --repair` calls it so again");
+        let names_anothers = Name::of(&row.pyramid).is_some_and(|own| own.is_after(&row.name));
+        if let Some(tile) = row.tile.as_ref().filter(|_| names_anothers) {
+            self.call(entry, tile, tile, of, None).await?;
         }
-        self.tell(entry, row, reason, repair);
         Ok(())
     }
 

@@ -14,6 +14,17 @@ impl Check<'_> {
     pub(super) async fn half_deleted(&mut self, entry: &VolumeEntry) -> Result<(), CheckError> {
         let volume = &entry.volume.name;
         for row in self.archive.catalog().half_deleted(volume).await? {
+            // Before it is called otherwise.
+            let (id, name, pyramid) = match &row {
+                Ok(tile) => (tile.id, Some(&*tile.name), &tile.pyramid),
+                Err(spoilt) => {
+                    let (Ok(pyramid) | Err(pyramid)) = &spoilt.pyramid;
+                    (spoilt.id, spoilt.name.as_deref().ok(), pyramid)
+                }
+            };
+            if self.is_undecided(id, name, pyramid) {
+                continue;
+            }
             let row = match row {
                 // The record that ended the tile of that name says nothing of another's row.
                 Ok(tile) if self.is_told_deleted(&tile.name) => {
@@ -30,10 +41,6 @@ impl Check<'_> {
                 self.named.insert(self.hasher.hash_one(pyramid));
             }
             let id = row.as_ref().map_or_else(|spoilt| spoilt.id, |tile| tile.id);
-            let called = name.map(String::as_str);
-            if self.is_undecided(id, called, pyramid.map_or("", String::as_str)) {
-                continue;
-            }
             let is_told = name.is_some_and(|name| self.is_told_deleted(name));
             let is_known = !is_told && self.history.was_deleted(id, 0);
             if is_told || is_known {
