@@ -36,6 +36,7 @@ mod records;
 mod repair;
 mod report;
 mod revisions;
+mod set_aside;
 mod shared;
 #[cfg(test)]
 mod tests;
@@ -201,6 +202,9 @@ pub async fn check(
     }
     check.orphans().await?;
     check.recount().await?;
+    for volume in &looked_at {
+        check.no_longer_set_aside(volume).await?;
+    }
     let mut report = check.report;
     for (number, index) in pending.into_iter().filter(|_| options.repair) {
         let finding = &mut report.findings[number];

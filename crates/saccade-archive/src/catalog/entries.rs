@@ -8,7 +8,7 @@ use saccade_core::volume::Volume;
 use saccade_core::voxel_box::VoxelBox;
 use serde::{Deserialize, Serialize};
 
-use crate::acquisition::TileRecord;
+use crate::acquisition::{RecordReader, TileRecord};
 
 /// Names a tile within its catalog, for good.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -101,6 +101,15 @@ pub struct Quarantined {
     pub at: SystemTime,
     /// Position of its record, if only its image did not come: once it is there, it is taken in.
     pub awaited: Option<u64>,
+}
+
+impl Quarantined {
+    /// Whether an image could not become a tile, for which its record is to come once more. Other records are past: they changed
+    /// nothing.
+    pub fn is_of_an_image(&self) -> bool {
+        // Of what waited and cannot be understood, the image is not known any more.
+        self.file != RecordReader::FILE || self.bytes == Some(0)
+    }
 }
 
 /// A record whose file is not whole yet.

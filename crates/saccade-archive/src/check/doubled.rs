@@ -34,13 +34,16 @@ impl Check<'_> {
         }
         let (catalog, volume) = (self.archive.catalog(), &entry.volume.name);
         let rows = catalog.rows_of_one_name(volume).await?;
-        if self.records.is_none() {
-            self.undecided.extend(rows.iter().map(|row| row.id));
-            return Ok(());
-        }
         let mut by_name = BTreeMap::<String, Vec<NamedRow>>::new();
         for row in rows {
             by_name.entry(row.name.clone()).or_default().push(row);
+        }
+        if self.records.is_none() {
+            for (name, rows) in by_name {
+                self.undecided.extend(rows.iter().map(|row| row.id));
+                self.not_told_without_records(entry, &name, &rows);
+            }
+            return Ok(());
         }
         for (name, rows) in by_name {
             let mut own = Vec::new();
@@ -193,15 +196,15 @@ impl Check<'_> {
         Ok(is_lost.then_some(of))
     }
 
-    /// Calls a row as the tile whose record its position is. One that names a pyramid of its own is called so when it is looked at.
+    /// Calls a row as the tile whose record its position is. One that names that one's pyramid is called so when it is looked at.
     async fn call_as_lost(
         &mut self,
         entry: &VolumeEntry,
         row: &NamedRow,
         of: &str,
     ) -> Result<(), CheckError> {
-        let names_anothers = Name::of(&row.pyramid).is_some_and(|own| own.is_after(&row.name));
-        if let Some(tile) = row.tile.as_ref().filter(|_| names_anothers) {
+        let names_its = Name::of(&row.pyramid).is_some_and(|own| own.is_after(of));
+        if let Some(tile) = row.tile.as_ref().filter(|_| !names_its && !row.deleted) {
             self.call(entry, tile, tile, of, None).await?;
         }
         Ok(())
@@ -255,6 +258,19 @@ impl Check<'_> {
              which is the tile's: {}; take the others out, then `saccade check --repair` does the rest",
             rows.len(),
             told.join(", ")
+        );
+        self.tell(entry, first, reason, None);
+    }
+
+    /// Rows of one name, where the records are not at hand, which may tell.
+    fn not_told_without_records(&mut self, entry: &VolumeEntry, name: &str, rows: &[NamedRow]) {
+        let Some(first) = rows.first() else {
+            return;
+        };
+        let reason = format!(
+            "{} rows of the catalog's table \"tiles\" have the name {name:?}: `saccade check --repair --acquisition FOLDER` finds out \
+             which is the tile's, and until then they stay as they are",
+            rows.len()
         );
         self.tell(entry, first, reason, None);
     }

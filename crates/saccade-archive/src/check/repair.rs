@@ -7,6 +7,10 @@ use super::{Check, CheckError, FindingKind, Repair};
 use crate::acquisition::{Record, RecordReader, TileRecord, image_path};
 use crate::catalog::{Quarantined, Tile, VolumeEntry, Waiting};
 
+/// How the reasons begin for which a check sets tiles aside; ingest's never do.
+pub(super) const WRONG: &str = "what the catalog says of it was found wrong";
+pub(super) const DAMAGED: &str = "its pyramid was found damaged";
+
 impl Check<'_> {
     /// The position of the record that a tile's pyramid was made of, or is to be: what its name says, unless the records are at
     /// hand and say that this is none of the tile's.
@@ -56,8 +60,8 @@ impl Check<'_> {
         reason: &str,
     ) -> Result<Repair, CheckError> {
         let what = match kind {
-            FindingKind::Spoilt => "what the catalog says of it was found wrong",
-            _ => "its pyramid was found damaged",
+            FindingKind::Spoilt => WRONG,
+            _ => DAMAGED,
         };
         let reason = format!("{what}: {reason}");
         if let Source::There(position, record) = source {
@@ -186,12 +190,12 @@ impl Source {
                 )
             }
             Self::NoRecord => {
-                ", and no record of the acquisition's folder is of it: append the tile's record once more, and ingest makes it anew"
+                ", and no record of the acquisition's folder is of it: append the tile's record once more, with the transform that it is to have, and ingest makes it anew"
                     .to_owned()
             }
             Self::NoRecords => {
-                "; append the tile's record to its acquisition once more, and ingest makes it anew; with --acquisition FOLDER, \
-                 --repair does so"
+                "; append the tile's record to its acquisition once more, with the transform that it is to have, and ingest makes it \
+                 anew; with --acquisition FOLDER, --repair does so"
                     .to_owned()
             }
         }

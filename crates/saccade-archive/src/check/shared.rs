@@ -1,8 +1,7 @@
 //! Tiles that name one pyramid.
 
-use super::repair::position_of;
+use super::repair::{WRONG, position_of};
 use super::{Check, CheckError, Finding, FindingKind, Repair};
-use crate::acquisition::RecordReader;
 use crate::catalog::{Origin, Quarantined, Tile, VolumeEntry, Waiting};
 
 impl Check<'_> {
@@ -74,12 +73,13 @@ impl Check<'_> {
             }
             None => {
                 let what = Quarantined {
-                    file: RecordReader::FILE.to_owned(),
+                    file: pyramid.to_owned(),
                     tile: Some(origin.tile.clone()),
                     reason: format!(
-                        "{reason}; append the tile's record to its acquisition once more, and ingest makes its own"
+                        "{WRONG}: {reason}; append the tile's record to its acquisition once more, with the transform that it is to \
+                         have, and ingest makes its own"
                     ),
-                    bytes: Some(0),
+                    bytes: None,
                     at: self.archive.catalog().clock().now(),
                     awaited: None,
                 };

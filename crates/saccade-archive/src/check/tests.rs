@@ -17,6 +17,7 @@ mod doubled;
 mod meanwhile;
 mod meddled;
 mod rows;
+mod set_aside;
 mod unsound;
 
 const VOLUME: &str = "v";

@@ -58,7 +58,9 @@ pub(super) async fn lacking_indexes(
         let mut reason = format!("the catalog's file lacks its index {index:?}");
         let mut repair = None;
         if !options.repair {
-            reason.push_str(": `saccade check --repair` makes it anew");
+            reason.push_str(
+                ": `saccade check --repair` makes it anew, where no two rows have one name",
+            );
         } else if catalog.make_index(&index).await? {
             repair = Some(Repair::Reindexed);
         }
@@ -91,7 +93,7 @@ pub(super) async fn make_at_last(
             "of which the records of the acquisition do not tell whose it is: take those out of its table \"tiles\" that are not, or \
              put a copy of the catalog there, from which `saccade ingest` goes on"
         }
-        None => "give --acquisition as well, which tells whose it is",
+        None => "give --acquisition FOLDER as well, whose records tell whose it is",
     };
     let said = format!(", which cannot be made while two rows have one name: {how}");
     finding.reason.push_str(&said);

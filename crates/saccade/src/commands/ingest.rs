@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
-use saccade_archive::acquisition::{AcquisitionInfo, RecordReader};
+use saccade_archive::acquisition::AcquisitionInfo;
 use saccade_archive::catalog::Catalog;
 use saccade_archive::clock::{Clock as _, SystemClock};
 use saccade_archive::pyramid::{Encoding, PyramidIndex};
@@ -183,7 +183,7 @@ async fn say_what_is_left(
             "{count} unfinished, taken up when it is started again: {named}"
         ));
     }
-    let images = all.iter().filter(|one| one.file != RecordReader::FILE);
+    let images = all.iter().filter(|one| one.is_of_an_image());
     Ok(images.count())
 }
 

@@ -90,6 +90,24 @@ impl Commit<'_> {
         Ok(())
     }
 
+    /// Forgets what was noted of a file or record that could not become a tile.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn no_longer_set_aside(&mut self, what: &Quarantined) -> Result<(), CatalogError> {
+        let forget =
+            "DELETE FROM quarantine WHERE volume = $1 AND tile = $2 AND file = $3 AND reason = $4";
+        let values = [
+            self.volume.into(),
+            Value::MaybeText(what.tile.as_deref()),
+            (&what.file).into(),
+            (&what.reason).into(),
+        ];
+        self.run(forget, &values).await?;
+        Ok(())
+    }
+
     /// Remembers how far the records were read.
     ///
     /// # Errors

@@ -1,6 +1,7 @@
 //! Rows of one name.
 
 use super::*;
+use crate::acquisition::DeleteRecord;
 
 /// What the index would have refused is mended first.
 #[tokio::test]
@@ -17,6 +18,17 @@ async fn a_name_that_two_rows_have_keeps_its_index_from_being_made() {
         "{}",
         index.reason
     );
+    // Which they are, whoever asks.
+    for report in [without, fixture.check(false).await] {
+        let reasons = { report.findings.iter() }.map(|finding| &finding.reason);
+        let told: Vec<_> = reasons.filter(|r| r.contains("2 rows of")).collect();
+        let [told] = told[..] else {
+            panic!("{:?}", report.findings);
+        };
+        for what in ["\"t1\"", "--repair --acquisition FOLDER"] {
+            assert!(told.contains(what), "{what}: {told}");
+        }
+    }
     let repaired = fixture.repair(true).await;
     assert_eq!(repaired.findings[0].repair, Some(Repair::Reindexed));
     assert!(fixture.has_all());
@@ -227,5 +239,31 @@ async fn a_row_with_anothers_name_and_pyramid_is_mended_at_once() {
         }
         let of = catalog.tile(VOLUME, of).await.unwrap().unwrap();
         assert!(of.pyramid.contains(&of.name), "{}", of.pyramid);
+    }
+}
+
+/// A row that has the name of a tile that was deleted, and no pyramid.
+#[tokio::test]
+async fn a_row_with_a_deleted_tiles_name_and_no_pyramid_is_made_anew_at_once() {
+    for by_record in [false, true] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        match by_record {
+            true => {
+                let gone = DeleteRecord { tile: "t2".into() };
+                let position = fixture.append(&Record::Delete(gone)).await;
+                catalog.delete_tile(VOLUME, "t2", position).await.unwrap();
+            }
+            false => fixture.delete("t2").await,
+        }
+        let meddle = "UPDATE tiles SET name = 't2', pyramid = '' WHERE name = 't4'";
+        fixture.meddle(&["DROP INDEX tiles_by_name", meddle]).await;
+        let repaired = fixture.repair(true).await;
+        assert_eq!(repaired.damage(), 0, "{by_record}: {:?}", repaired.findings);
+        assert_eq!(catalog.lacking_indexes().await.unwrap(), [""; 0]);
+        assert_eq!(catalog.tile(VOLUME, "t2").await.unwrap(), None);
+        fixture.ingest().await;
+        assert!(catalog.tile(VOLUME, "t4").await.unwrap().is_some());
+        assert_eq!(fixture.look(false).await.damage(), 0, "{by_record}");
     }
 }

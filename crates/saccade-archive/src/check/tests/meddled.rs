@@ -47,7 +47,7 @@ impl Fixture {
     }
 
     /// As ingest does with what waits for it.
-    async fn ingest(&self) {
+    pub(super) async fn ingest(&self) {
         let catalog = self.archive.catalog();
         for waiting in catalog.waiting(VOLUME).await.unwrap() {
             let (record, position) = (waiting.record, waiting.position);

@@ -1,0 +1,43 @@
+//! What an earlier check set aside, and nothing is wrong with any more.
+
+use super::repair::{DAMAGED, WRONG};
+use super::{Check, CheckError};
+
+impl Check<'_> {
+    /// Takes tiles out of quarantine that a check put there, and that are whole now, or deleted: no record will come that ends it.
+    pub(super) async fn no_longer_set_aside(&self, volume: &str) -> Result<(), CheckError> {
+        let catalog = self.archive.catalog();
+        if !self.options.repair {
+            return Ok(());
+        }
+        for what in catalog.quarantined(volume).await? {
+            let is_checks = [DAMAGED, WRONG]
+                .iter()
+                .any(|how| what.reason.starts_with(how));
+            let Some(tile) = what.tile.as_deref().filter(|_| is_checks) else {
+                continue;
+            };
+            if self.has_found(volume, tile) || !self.is_as_it_should_be(volume, tile).await? {
+                continue;
+            }
+            let mut commit = catalog.begin(volume).await?;
+            commit.no_longer_set_aside(&what).await?;
+            commit.finish().await?;
+        }
+        Ok(())
+    }
+
+    /// Whether anything was found of a tile, mended or not.
+    fn has_found(&self, volume: &str, tile: &str) -> bool {
+        let mut findings = self.report.findings.iter();
+        findings.any(|finding| {
+            finding.volume.as_deref() == Some(volume) && finding.tile.as_deref() == Some(tile)
+        })
+    }
+
+    /// Whether a tile of which nothing was found is deleted, or was looked at as a whole.
+    async fn is_as_it_should_be(&self, volume: &str, tile: &str) -> Result<bool, CheckError> {
+        let holder = self.archive.catalog().holder(volume, tile).await?;
+        Ok(holder.is_some_and(|row| row.deleted || !self.options.quick))
+    }
+}
