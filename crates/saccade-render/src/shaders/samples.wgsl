@@ -29,9 +29,10 @@ var<private> beside_before: array<f32, SLOTS>;
 // The levels that the largest values were drawn from and wanted at, in false colours.
 var<private> largest_from: array<vec2u, SLOTS>;
 
-// The surface that ends a ray: its channel and where it is.
+// The surface that ends a ray: its channel, where it is, and the value that it is of.
 var<private> surface: u32;
 var<private> surface_at: vec3f;
+var<private> surface_value: f32;
 // How far ahead of the first sample it is; nothing there is farther.
 var<private> hit_at: f32;
 // Light that comes through to it; 0 where there is none.
@@ -201,6 +202,8 @@ fn keep_at(channel: u32, number: f32, along: vec3f, ahead: f32, step: f32, besid
             hit_at = at;
             surface = channel;
             surface_at = in_brick(channel, number, along + (beside - back) * way, 0.0);
+            // Objects have the colours of their own numbers.
+            surface_value = select(iso, stored, has_flag(FLAG_NEAREST));
             // What begins where the ray does is cut there.
             surface_is_cut = is_first;
         }
@@ -371,10 +374,10 @@ fn largest_of(color: vec3f) -> f32 {
     return max(color.r, max(color.g, color.b));
 }
 
-// The colour of a channel's surface: of its value, but bright enough to be seen; in the hue of the brighter end of the table where
+// The colour of a channel's surface: of a value, but bright enough to be seen; in the hue of the brighter end of the table where
 // its own is black.
-fn surface_color(channel: u32) -> vec3f {
-    let own = color_of(channel, channel_of(channel).iso).rgb;
+fn surface_color(channel: u32, stored: f32) -> vec3f {
+    let own = color_of(channel, stored).rgb;
     let low = textureLoad(colors, vec2u(1u, channel), 0).rgb;
     let high = textureLoad(colors, vec2u(TABLE_LEN - 1u, channel), 0).rgb;
     let end = select(low, high, largest_of(high) >= largest_of(low));
@@ -415,6 +418,6 @@ fn lit_surface(ray: vec3f) -> vec3f {
     let facing = abs(dot(normal, ray)) / max(length(normal) * length(ray), 1e-30);
     // Where values do not change there is no surface to light: as if it faced the eye.
     let diffuse = select(facing, 1.0, length(normal) <= 1e-30);
-    let color = surface_color(surface);
+    let color = surface_color(surface, surface_value);
     return false_color(color, levels.x, levels.y) * (0.15 + 0.85 * diffuse);
 }

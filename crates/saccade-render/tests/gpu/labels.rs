@@ -1,4 +1,4 @@
-//! Numbers of objects: which they are says nothing of how objects look.
+//! Numbers of objects: they say which colours objects have, and nothing of their shapes.
 
 use std::sync::Arc;
 
@@ -15,9 +15,10 @@ const EDGE: u32 = 45;
 const VOXEL: f64 = 4.0;
 const RADIUS: f64 = 18.0;
 
-/// A ball of objects with these numbers, in octants.
+/// A ball of objects with these numbers, in octants; all of one colour.
 fn ball(kind: VoxelKind, numbers: [u8; 8], factor: u16) -> Scene {
-    let transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 1.0)], 1.0);
+    let mut transfer = ramp(Polarity::Bright, ColorMap::Gray, &[(0.0, 1.0)], 1.0);
+    transfer.window = [0.0, 1.0 / 255.0];
     let value = |nm: DVec3| {
         let from_middle = nm / VOXEL - f64::from(EDGE) / 2.0;
         let octant = usize::from(from_middle.x > 0.0)
@@ -76,6 +77,63 @@ fn surfaces_do_not_depend_on_numbers() {
     }
 }
 
+/// As the other modes have them.
+#[test]
+fn objects_have_the_colors_of_their_numbers() {
+    let Some(gpu) = gpu() else { return };
+    // Of one hue each, as the map has them at the ends of its range and in between.
+    let numbers = [20, 250, 120, 180, 20, 250, 120, 180];
+    for (factor, split) in [(1, false), (200, false), (200, true)] {
+        let colored = |kind, numbers| {
+            let mut scene = ball(kind, numbers, factor);
+            scene.transfer.color_map = ColorMap::Viridis;
+            scene.transfer.window = [0.0, 1.0];
+            let seen = picture(&gpu, &scene, split);
+            (scene, seen)
+        };
+        let (scene, many) = colored(VoxelKind::Labels, numbers);
+        keep(&format!("labels-colors-{factor}-{split}"), &many);
+        for number in &numbers[..4] {
+            let [red, green, blue] = scene.transfer.color_at(f32::from(*number) / 255.0);
+            let expected = hue([red, green, blue].map(f64::from));
+            let alone = colored(VoxelKind::Labels, [*number; 8]).1;
+            let near = |image: &Image| {
+                let seen = image.rgba.chunks_exact(4).filter(|pixel| pixel[1] > 40);
+                let apart = seen.map(|pixel| {
+                    let own = hue(linear(pixel));
+                    (0..3).map(|c| (own[c] - expected[c]).abs()).sum::<f64>()
+                });
+                let (near, far): (Vec<f64>, Vec<f64>) = apart.partition(|apart| *apart < 0.1);
+                (near.len(), far.len())
+            };
+            let (of_it, of_others) = near(&alone);
+            assert!(
+                of_it > 500 && of_others == 0,
+                "{number}: {of_it} pixels, {of_others} others"
+            );
+            // Among others, too; not all have as much of the side that is seen.
+            let (of_it, of_others) = near(&many);
+            assert!(
+                of_it > 50 && of_others > 500,
+                "{number} of several: {of_it}, {of_others}"
+            );
+            // Shades have that of the surface, whatever lies behind it.
+            let (of_it, _) = near(&colored(VoxelKind::Intensity, [*number; 8]).1);
+            assert_eq!(of_it, 0, "{number} as a shade");
+        }
+    }
+}
+
+fn linear(pixel: &[u8]) -> [f64; 3] {
+    [0, 1, 2].map(|c| f64::from(linear_from_srgb(f32::from(pixel[c]) / 255.0)))
+}
+
+/// Shares of a colour's parts, whatever its brightness.
+fn hue(color: [f64; 3]) -> [f64; 3] {
+    let sum: f64 = color.iter().sum();
+    color.map(|part| part / sum.max(1e-9))
+}
+
 /// A ball is brightest in its middle and darker towards its edge, smoothly enough to be seen as one.
 #[test]
 fn objects_are_lit_as_round_as_they_are() {
@@ -99,8 +157,7 @@ fn objects_are_lit_as_round_as_they_are() {
         let facing = (1.0 - beside * beside).sqrt();
         let lit = 0.15 + 0.85 * facing;
         let linear = linear_from_srgb(f32::from(pixel[0]) / 255.0);
-        // The surface's own colour is half as bright as can be.
-        sum += (f64::from(linear) / 0.5 - lit).abs();
+        sum += (f64::from(linear) - lit).abs();
         count += 1.0;
         most = most.max(pixel[0]);
         least = least.min(pixel[0]);
