@@ -107,7 +107,11 @@ pub(crate) static GROUPS: &[Group] = &[
     },
     Group {
         ids: render::IDS,
-        measure: |_| render::measure(),
+        measure: render::measure,
+    },
+    Group {
+        ids: render::SEGMENTED_IDS,
+        measure: render::measure_segmented,
     },
     Group {
         ids: serve::SLOWLORIS_IDS,
