@@ -35,6 +35,7 @@ mod history;
 mod holders;
 mod identity;
 mod location;
+mod lost_volumes;
 mod origins;
 mod postgres;
 mod remembered;
@@ -67,6 +68,7 @@ pub use entries::{
 pub use error::CatalogError;
 pub use history::{History, LastChange};
 pub use location::CatalogLocation;
+pub use lost_volumes::LostVolume;
 pub use origins::{Ahead, Holder, NamedRow, Naming, Origin, Placing};
 pub use revision::WrongRevision;
 pub use spoilt::{Listed, SpoiltTile};
@@ -232,7 +234,8 @@ impl Catalog {
         check_name(&volume.name)?;
         let there = match self.volume(&volume.name).await {
             Err(CatalogError::UnknownVolume { .. }) => {
-                self.insert_volume(volume).await?;
+                let description = serde_json::to_string(volume).expect("a volume becomes JSON");
+                self.insert_volume(&volume.name, &description).await?;
                 self.volume(&volume.name).await?
             }
             there => there?,
@@ -246,17 +249,6 @@ impl Catalog {
                 asked,
             }),
         }
-    }
-
-    async fn insert_volume(&self, volume: &Volume) -> Result<(), CatalogError> {
-        let description = serde_json::to_string(volume).expect("a volume becomes JSON");
-        let insert =
-            "INSERT INTO volumes (name, description) VALUES ($1, $2) ON CONFLICT DO NOTHING";
-        let mut transaction = self.transaction(Durability::Durable).await?;
-        let values = [(&volume.name).into(), (&description).into()];
-        let done = transaction.run(insert, &values).await;
-        done.map_err(|e| self.failed(e))?;
-        transaction.commit().await.map_err(|e| self.failed(e))
     }
 
     /// A volume.

@@ -27,6 +27,7 @@ mod cursor;
 mod described;
 mod doubled;
 mod half_deleted;
+mod lost_volumes;
 mod misnamed;
 mod misplaced;
 mod moved;
@@ -185,6 +186,7 @@ pub async fn check(
         renamed: HashSet::new(),
         called: HashMap::new(),
     };
+    check.lost_volumes().await?;
     check.find_owner(&volumes).await?;
     let mut looked_at = Vec::new();
     for volume in volumes {
@@ -536,6 +538,7 @@ impl Check<'_> {
                 }
                 if [level.width, level.height] == tile.size.to_array() {
                     self.compare_type(entry, tile, verified.index.dtype());
+                    self.compare_section(entry, tile);
                     return Ok(());
                 }
                 let catalog = self.archive.catalog();

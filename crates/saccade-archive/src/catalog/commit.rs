@@ -88,6 +88,8 @@ struct Existing {
     /// 0 where it cannot be: any record is newer.
     position: u64,
     transform_position: u64,
+    /// Whether somebody other than the records put it where it lies, 0 or 1, if that is known.
+    moved: Option<i64>,
 }
 
 impl Existing {
@@ -159,12 +161,13 @@ impl<'c> Commit<'c> {
         // The newest record says where the tile lies, if any of it is inside then; if this one is done once more, whoever
         // moved the tile since.
         let newer = { existing.as_ref() }.filter(|e| e.transform_position >= tile.position);
-        let newer = newer.and_then(|e| Some((e.transform?, e.transform_position)));
+        let newer = newer.and_then(|e| Some((e.transform?, e.transform_position, e.moved)));
         let inside = |at: &_| place(self.extent, tile.section, tile.size, *at).is_some();
-        let newer = newer.filter(|(at, _)| inside(at));
-        let early = early.map(|(at, position)| (at, position.max(tile.position)));
+        let newer = newer.filter(|(at, ..)| inside(at));
+        let early = early.map(|(at, position)| (at, position.max(tile.position), None));
         let newest = newer.into_iter().chain(early).max_by_key(|said| said.1);
-        let (transform, transform_position) = newest.unwrap_or((tile.transform, tile.position));
+        let (transform, transform_position, moved) =
+            newest.unwrap_or((tile.transform, tile.position, Some(0)));
         let place = self.place(&tile.name, tile.section, tile.size, transform)?;
         let id = match known {
             Some(id) => id,
@@ -181,7 +184,7 @@ impl<'c> Commit<'c> {
         let update = "UPDATE tiles SET deleted = 0, section = $2, channel = $3, width = $4, \
                       height = $5, pyramid = $6, revision = $7, position = $8, \
                       transform_position = $9, a = $10, b = $11, c = $12, d = $13, tx = $14, \
-                      ty = $15 WHERE id = $1";
+                      ty = $15, moved = $16 WHERE id = $1";
         let mut values = vec![
             id.0.into(),
             tile.section.into(),
@@ -194,6 +197,7 @@ impl<'c> Commit<'c> {
             transform_position.into(),
         ];
         values.extend(transform.elements().map(Value::from));
+        values.push(Value::MaybeInteger(moved));
         self.run(update, &values).await?;
         self.end_quarantine(&tile.name, tile.position).await?;
         self.forget_retired(&tile.pyramid).await?;
@@ -251,6 +255,7 @@ impl<'c> Commit<'c> {
         if position.is_some_and(|position| existing.transform_position >= position) {
             return Ok(TransformOutcome::Unchanged);
         }
+        let by_somebody = i64::from(position.is_none());
         let position = position.unwrap_or(existing.transform_position);
         let place = self.place(tile, section, size, transform)?;
         self.end_misplacement(tile).await?;
@@ -265,9 +270,9 @@ impl<'c> Commit<'c> {
             values.extend(transform.elements().map(Value::from));
             self.run(update, &values).await?;
         }
-        let update = "UPDATE tiles SET transform_position = $2 WHERE id = $1";
-        self.run(update, &[existing.id.0.into(), position.into()])
-            .await?;
+        let update = "UPDATE tiles SET transform_position = $2, moved = $3 WHERE id = $1";
+        let values = [existing.id.0.into(), position.into(), by_somebody.into()];
+        self.run(update, &values).await?;
         Ok(if moved {
             TransformOutcome::Moved
         } else {
@@ -500,7 +505,7 @@ impl<'c> Commit<'c> {
 
     async fn existing(&mut self, name: &str) -> Result<Option<Existing>, CatalogError> {
         let question = "SELECT id, deleted, section, width, height, a, b, c, d, tx, ty, pyramid, \
-                        position, transform_position FROM tiles WHERE volume = $1 AND name = $2";
+                        position, transform_position, moved FROM tiles WHERE volume = $1 AND name = $2";
         let row = self
             .one(question, &[self.volume.into(), name.into()])
             .await?;
@@ -529,6 +534,7 @@ impl<'c> Commit<'c> {
                 pyramid: rows::pyramid(&row).ok(),
                 position: rows::unsigned(&row, "position").unwrap_or(0),
                 transform_position: rows::unsigned(&row, "transform_position").unwrap_or(0),
+                moved: row.get::<Option<i64>>("moved").ok().flatten(),
             })
         };
         decode().map(Some).map_err(|e| self.catalog.failed(e))

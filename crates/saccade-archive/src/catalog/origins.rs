@@ -25,6 +25,8 @@ pub struct Placing {
     pub transform_position: u64,
     /// The volume's revision when the tile last changed.
     pub revision: u64,
+    /// Whether somebody other than the records put it there, if that is known.
+    pub moved: Option<bool>,
     /// Which voxels changed then \[level-0 voxels\]; `None` if that is no longer kept.
     pub change: Option<VoxelBox>,
 }
@@ -95,7 +97,7 @@ pub struct Ahead {
 macro_rules! placings {
     ($which:literal) => {
         concat!(
-            "SELECT t.id AS placed, t.transform_position AS transform_position, t.revision AS placed_at, \
+            "SELECT t.id AS placed, t.transform_position AS transform_position, t.revision AS placed_at, t.moved AS moved, \
              coalesce(c.revision, -1) AS revision, coalesce(c.tile, -1) AS tile, \
              coalesce(c.section, 0) AS section, coalesce(c.x0, 0) AS x0, coalesce(c.y0, 0) AS y0, \
              coalesce(c.x1, 0) AS x1, coalesce(c.y1, 0) AS y1, coalesce(c.reason, 'tile') AS reason \
@@ -121,6 +123,7 @@ fn placing(row: &Row) -> Result<Option<Placing>, sqlx::Error> {
         tile: TileId(row.get("placed")?),
         transform_position,
         revision,
+        moved: { row.get::<Option<i64>>("moved").ok().flatten() }.map(|moved| moved != 0),
         change: change.map(|change| change.voxels),
     }))
 }

@@ -2,6 +2,7 @@
 
 use saccade_core::volume::{Dtype, Volume};
 
+use super::names::Name;
 use super::{Check, CheckError, FindingKind};
 use crate::acquisition::AcquisitionInfo;
 use crate::catalog::{Tile, VolumeEntry, differences};
@@ -37,6 +38,25 @@ impl Check<'_> {
             );
             self.find(FindingKind::Spoilt, entry, None, reason);
         }
+    }
+
+    /// Finds a tile whose pyramid was made for another section than its row has it in, where the records are not at hand, which tell.
+    pub(super) fn compare_section(&mut self, entry: &VolumeEntry, tile: &Tile) {
+        let made_for = Name::of(&tile.pyramid).filter(|name| {
+            name.volume == entry.volume.name && name.is_after(&tile.name) && self.records.is_none()
+        });
+        let Some(section) = made_for
+            .map(|name| name.section)
+            .filter(|z| *z != tile.section)
+        else {
+            return;
+        };
+        let reason = format!(
+            "its row has it in section {}, its pyramid was made for section {section}: with --acquisition FOLDER, `saccade check --repair` \
+             has it where its record says",
+            tile.section
+        );
+        self.find(FindingKind::Spoilt, entry, Some(tile), reason);
     }
 
     /// Notes of which type a pyramid's voxels are.

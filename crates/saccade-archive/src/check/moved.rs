@@ -1,7 +1,8 @@
 //! Tiles that lie where nothing says that they do.
 //!
-//! `saccade update` moves tiles as well, and nobody records that but the catalog: where the newest record was followed, another
-//! place is taken for that, unless the catalog's own list of changes says otherwise.
+//! `saccade update` moves tiles as well, and nobody records that but the catalog, which notes it with the tile. Where an earlier
+//! version has not, and the newest record was followed, another place is taken for that, unless the catalog's own list of changes says
+//! otherwise.
 
 use saccade_core::transform::SectionFromTile;
 use saccade_core::voxel_box::VoxelBox;
@@ -41,7 +42,8 @@ impl Check<'_> {
         let Some(placing) = placing.copied() else {
             return Ok(None);
         };
-        if placing.change.is_none() && self.lacks_change(entry, &placing).await? {
+        let is_told = placing.moved == Some(false) || placing.change.is_some();
+        if !is_told && self.lacks_change(entry, &placing).await? {
             return self.untold(entry, tile, said).await;
         }
         let Some((to, reason)) = self.its_place(entry, &shaped, said, &placing) else {
@@ -201,6 +203,9 @@ impl Check<'_> {
         };
         if now.transform_position != said.position && is_of(now.transform_position) == Some(true) {
             return Some("that one was not followed");
+        }
+        if now.moved == Some(false) && now.transform_position == said.position {
+            return Some("nobody else has moved it, as the catalog tells");
         }
         let lies = place(
             entry.volume.extent(),

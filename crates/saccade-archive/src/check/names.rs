@@ -9,6 +9,7 @@ use super::repair::position_of;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Name<'n> {
     pub(super) volume: &'n str,
+    pub(super) section: u32,
     /// What it has of the tile's name, and the number of the attempt.
     tile: &'n str,
     /// Position of the record.
@@ -20,10 +21,11 @@ impl<'n> Name<'n> {
     pub(super) fn of(pyramid: &'n str) -> Option<Self> {
         let mut parts = pyramid.strip_prefix("tiles/")?.split('/');
         let (volume, section, file) = (parts.next()?, parts.next()?, parts.next()?);
-        section.parse::<u32>().ok()?;
+        let section = section.parse().ok()?;
         let (tile, _) = file.rsplit_once('-')?;
         let name = Self {
             volume,
+            section,
             tile,
             position: position_of(file)?,
         };
@@ -76,7 +78,7 @@ mod tests {
     #[test]
     fn names_say_what_ingest_puts_into_them() {
         let name = Name::of("tiles/v/000003/a_b-c-again2-3cf.tif").unwrap();
-        assert_eq!((name.volume, name.position), ("v", 0x3cf));
+        assert_eq!((name.volume, name.section, name.position), ("v", 3, 0x3cf));
         for tile in ["a b-c", "a/b-c", "a_b-c", "a b-c-again2"] {
             assert!(name.is_after(tile), "{tile}");
         }

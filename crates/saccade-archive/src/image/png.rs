@@ -12,6 +12,9 @@ use super::{
 
 pub(super) fn decode(bytes: &[u8], wanted: Wanted) -> Result<Image, ImageError> {
     check_png(bytes)?;
+    // The decoder's own limits would not tell which.
+    let [width, height] = size(bytes)?;
+    wanted.check_size(width, height)?;
     let mut decoder = Decoder::new(Cursor::new(bytes));
     // Palettes become colours, fewer bits become eight; labels stay the numbers that they are.
     decoder.set_transformations(if wanted.labels {

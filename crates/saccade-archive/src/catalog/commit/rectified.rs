@@ -119,7 +119,7 @@ impl Commit<'_> {
         let at = place(self.extent, tile.section, tile.size, tile.transform);
         self.log_change(tile.id, at, at, ChangeReason::Transform)
             .await?;
-        let update = "UPDATE tiles SET revision = $4 \
+        let update = "UPDATE tiles SET revision = $4, moved = 1 \
                       WHERE id = $1 AND volume = $2 AND revision = $3 AND deleted = 0";
         let values = [
             tile.id.0.into(),
@@ -156,7 +156,7 @@ impl Commit<'_> {
         let (old, new) = (at(tile.transform), at(to));
         self.log_change(tile.id, old, new, ChangeReason::Transform)
             .await?;
-        let update = "UPDATE tiles SET revision = $4, a = $5, b = $6, c = $7, d = $8, tx = $9, ty = $10 \
+        let update = "UPDATE tiles SET revision = $4, a = $5, b = $6, c = $7, d = $8, tx = $9, ty = $10, moved = NULL \
                       WHERE id = $1 AND volume = $2 AND revision = $3 AND deleted = 0";
         let mut values = vec![
             tile.id.0.into(),

@@ -18,7 +18,7 @@ impl Commit<'_> {
         self.log_change(tile.id, None, Some(place), ChangeReason::Tile)
             .await?;
         let update = "UPDATE tiles SET deleted = 0, revision = $3, pyramid = $4, a = $5, b = $6, c = $7, d = $8, \
-                      tx = $9, ty = $10 WHERE id = $1 AND volume = $2 AND deleted <> 0 \
+                      tx = $9, ty = $10, moved = NULL WHERE id = $1 AND volume = $2 AND deleted <> 0 \
                       AND (pyramid = $4 OR pyramid = '')";
         let mut values = vec![
             tile.id.0.into(),

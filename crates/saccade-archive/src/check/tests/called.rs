@@ -408,9 +408,13 @@ async fn what_the_lost_changes_would_tell_is_not_guessed() {
         fixture.meddle(&[lost]).await;
         // Where all lies as recorded, nothing is in doubt.
         assert_eq!(fixture.look(false).await.findings, []);
-        fixture
-            .meddle(&["UPDATE tiles SET tx = 100 WHERE name = 't2'"])
-            .await;
+        // Nobody else has moved it.
+        let elsewhere = "UPDATE tiles SET tx = 100 WHERE name = 't2'";
+        fixture.meddle(&[elsewhere]).await;
+        let moved = [(FindingKind::Spoilt, Some(Repair::Moved))];
+        assert_eq!(repairs(&fixture.look(true).await), moved);
+        assert_eq!(fixture.transform("t2").await.elements()[4], 3.0);
+        fixture.meddle(&[lost, elsewhere]).await;
         let report = fixture.look(false).await;
         assert_eq!(found(&report), [(FindingKind::Spoilt, "t2")]);
         let reason = &report.findings[0].reason;

@@ -495,3 +495,47 @@ async fn tiles_that_were_deleted_and_are_called_there_are_deleted_again() {
         assert_eq!(fixture.look(false).await.findings, []);
     }
 }
+
+/// Where a tile covers all of its section, no box of the changes tells one place from another.
+#[tokio::test]
+async fn of_a_tile_that_nobody_else_moved_the_place_is_its_records() {
+    let large = |x: f64| SectionFromTile::new([10.0, 0.0, 0.0, 10.0, x, -300.0]).unwrap();
+    for by_hand in [false, true] {
+        for is_known in [false, true] {
+            let fixture = Fixture::new().await;
+            let catalog = fixture.archive.catalog();
+            let to = large(-500.0);
+            let position = fixture.append(&move_it("t2", to)).await;
+            let mut commit = catalog.begin(VOLUME).await.unwrap();
+            commit.transform("t2", to, Some(position)).await.unwrap();
+            commit.finish().await.unwrap();
+            // As somebody says, or as nobody does.
+            let elsewhere = large(-530.0);
+            match by_hand {
+                true => {
+                    let row = "UPDATE tiles SET tx = -530 WHERE name = 't2'";
+                    fixture.meddle(&[row]).await;
+                }
+                false => {
+                    let moved = catalog.set_transform(VOLUME, "t2", elsewhere).await;
+                    moved.unwrap();
+                }
+            }
+            // Of tiles that an earlier version moved it is not known.
+            let earlier = "UPDATE tiles SET moved = NULL";
+            if !is_known {
+                fixture.meddle(&[earlier]).await;
+            }
+            let report = fixture.look(true).await;
+            if by_hand && is_known {
+                let moved = [(FindingKind::Spoilt, Some(Repair::Moved))];
+                assert_eq!(repairs(&report), moved, "{:?}", report.findings);
+                assert_eq!(fixture.transform("t2").await, to);
+            } else {
+                assert_eq!(report.findings, [], "{by_hand} {is_known}");
+                assert_eq!(fixture.transform("t2").await, elsewhere);
+            }
+            assert_eq!(fixture.look(false).await.findings, []);
+        }
+    }
+}

@@ -352,13 +352,19 @@ async fn what_a_row_of_no_volume_names_is_told_and_not_deleted() {
     };
     for gone in [true, false] {
         let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+        let [lost, findings @ ..] = &report.findings[..] else {
+            panic!("nothing is found");
+        };
+        for word in ["number 2", "6 of its tiles", "--acquisition"] {
+            assert!(lost.reason.contains(word), "{}", lost.reason);
+        }
         let (strays, others): (Vec<_>, Vec<_>) =
-            { report.findings.iter() }.partition(|f| f.kind == FindingKind::Spoilt);
+            { findings.iter() }.partition(|f| f.kind == FindingKind::Spoilt);
         let told: Vec<_> = { strays.iter() }
             .map(|f| (f.tile.clone().unwrap(), f.repair))
             .collect();
         let want: Vec<_> = (0..TILES).map(|n| (format!("t{n}"), None)).collect();
-        assert_eq!((told, report.damage()), (want, 6));
+        assert_eq!((told, report.damage()), (want, 7));
         for word in [
             "no volume of its number 2",
             "never deleted",
@@ -374,26 +380,82 @@ async fn what_a_row_of_no_volume_names_is_told_and_not_deleted() {
     }
 }
 
-/// Where the volume itself is gone, there is none that could be held against records.
+/// Without foreign keys, which a file has only for who asks for them.
+async fn lose_volume(fixture: &Fixture) {
+    let lose = "PRAGMA foreign_keys = OFF; DELETE FROM volumes; PRAGMA foreign_keys = ON";
+    fixture.meddle(&[lose]).await;
+}
+
 #[tokio::test]
-async fn what_a_row_of_a_volume_that_is_gone_names_comes_back_with_ingest() {
+async fn a_volume_that_was_lost_is_told_and_gets_its_tiles_again() {
     let fixture = Fixture::new().await;
-    let file = fixture.folder.path().join("catalog.sqlite");
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(file);
-    let mut meddle = options.foreign_keys(false).connect().await.unwrap();
-    let gone = sqlx::query("DELETE FROM volumes")
-        .execute(&mut meddle)
-        .await;
-    gone.unwrap();
-    meddle.close().await.unwrap();
-    let report = fixture.check(false).await;
-    assert_eq!(report.findings.len(), 6);
-    for finding in report.findings {
-        let reason = finding.reason;
-        assert!(!reason.contains("saccade check --repair"), "{reason}");
-        assert!(
-            reason.contains("`saccade ingest FOLDER` of its acquisition makes volume \"v\""),
-            "{reason}"
-        );
+    let catalog = fixture.archive.catalog();
+    let before = catalog.entry(VOLUME).await.unwrap();
+    lose_volume(&fixture).await;
+    // However young its pyramids are.
+    for safe_age in [Duration::ZERO, Duration::from_secs(3600)] {
+        for (quick, repair) in [(false, false), (true, false), (false, true)] {
+            let options = CheckOptions {
+                quick,
+                repair,
+                acquisition: repair.then(|| fixture.acquisition.path().to_owned()),
+                safe_age,
+                ..CheckOptions::default()
+            };
+            let report = check(&fixture.archive, &options, &|_, _| {}).await.unwrap();
+            let [found] = &report.findings[..] else {
+                panic!("{:?}", report.findings);
+            };
+            assert_eq!(found.volume.as_deref(), Some(VOLUME));
+            assert!(found.reason.contains("saccade ingest"), "{}", found.reason);
+            assert_eq!((report.damage(), report.young), (1, 0));
+        }
     }
+    assert!(fixture.has_all());
+    // Another takes neither its number nor its tiles.
+    let other = Volume {
+        name: "other".to_owned(),
+        ..before.volume.clone()
+    };
+    catalog.create_volume(&other).await.unwrap();
+    assert_eq!(catalog.entry("other").await.unwrap().tiles, 0);
+    assert_eq!(catalog.tile("other", "t0").await.unwrap(), None);
+    assert_eq!(catalog.cursor("other").await.unwrap(), Cursor::default());
+    // It does.
+    catalog.create_volume(&before.volume).await.unwrap();
+    assert_eq!(catalog.entry(VOLUME).await.unwrap(), before);
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+#[tokio::test]
+async fn no_volume_gets_a_number_whose_records_were_read() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    let volume = catalog.entry(VOLUME).await.unwrap().volume;
+    lose_volume(&fixture).await;
+    fixture.meddle(&["DELETE FROM tiles"]).await;
+    catalog.create_volume(&volume).await.unwrap();
+    // Its records are read from the first on.
+    assert_eq!(catalog.cursor(VOLUME).await.unwrap(), Cursor::default());
+}
+
+/// A section that a row's pyramid was not made for.
+#[tokio::test]
+async fn a_tile_in_another_section_than_its_pyramid_is_told_without_records() {
+    let fixture = Fixture::new().await;
+    fixture
+        .meddle(&["UPDATE tiles SET section = section + 1 WHERE name = 't5'"])
+        .await;
+    let told = fixture.check(false).await;
+    let reasons: Vec<_> = { told.findings.iter() }.map(|f| &f.reason).collect();
+    assert!(
+        { reasons.iter() }
+            .any(|reason| reason.contains("section 3, its pyramid was made for section 2")),
+        "{reasons:?}"
+    );
+    assert_eq!(fixture.look(true).await.damage(), 0);
+    fixture.ingest().await;
+    assert_eq!(fixture.look(false).await.damage(), 0);
+    let sound = fixture.archive.catalog().tile(VOLUME, "t5").await.unwrap();
+    assert_eq!(sound.unwrap().section, 2);
 }

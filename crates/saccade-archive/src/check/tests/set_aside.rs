@@ -71,6 +71,7 @@ async fn a_tile_that_names_anothers_pyramid_is_of_an_image() {
     let fixture = Fixture::new().await;
     let shared = "UPDATE tiles SET pyramid = (SELECT pyramid FROM tiles WHERE name = 't2') WHERE name = 't3'";
     fixture.meddle(&[shared]).await;
+    let own = fs::read(fixture.path(3)).unwrap();
     fs::remove_file(fixture.path(3)).unwrap();
     let report = fixture.repair(false).await;
     assert_eq!(report.set_aside, 1, "{:?}", report.findings);
@@ -79,4 +80,13 @@ async fn a_tile_that_names_anothers_pyramid_is_of_an_image() {
     };
     assert!(what.is_of_an_image());
     assert!(what.reason.contains("transform"), "{}", what.reason);
+    // By the repair that mends it, not the one after.
+    fs::write(fixture.path(3), own).unwrap();
+    let report = fixture.repair(true).await;
+    assert_eq!(
+        (report.damage(), report.set_aside),
+        (0, 0),
+        "{:?}",
+        report.findings
+    );
 }
