@@ -1,3 +1,4 @@
--- Whether somebody other than the records has put a tile where it lies: 0 or 1, and nothing where that is not known.
+-- Who has put a tile where it lies: 0 where its records have; else a number of the transform that somebody else gave it; nothing where
+-- that is not known.
 
 ALTER TABLE tiles ADD COLUMN moved INTEGER;

@@ -14,7 +14,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::database::{Durability, Row, Statement, Transaction, Value};
 use super::tiles::RECOUNT;
-use super::{Catalog, CatalogError, ChangeReason, NewTile, TileId, place, postgres, rows};
+use super::{Catalog, CatalogError, ChangeReason, Mover, NewTile, TileId, place, postgres, rows};
 
 /// What became of a tile.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -88,8 +88,8 @@ struct Existing {
     /// 0 where it cannot be: any record is newer.
     position: u64,
     transform_position: u64,
-    /// Whether somebody other than the records put it where it lies, 0 or 1, if that is known.
-    moved: Option<i64>,
+    /// Who put it where it lies, if that is known.
+    moved: Option<Mover>,
 }
 
 impl Existing {
@@ -164,10 +164,14 @@ impl<'c> Commit<'c> {
         let newer = newer.and_then(|e| Some((e.transform?, e.transform_position, e.moved)));
         let inside = |at: &_| place(self.extent, tile.section, tile.size, *at).is_some();
         let newer = newer.filter(|(at, ..)| inside(at));
-        let early = early.map(|(at, position)| (at, position.max(tile.position), None));
+        let early = early.map(|(at, position)| {
+            // Whether it counts depends on what came before, of which records alone do not tell.
+            let by = Mover::somebody(at);
+            (at, position.max(tile.position), Some(by))
+        });
         let newest = newer.into_iter().chain(early).max_by_key(|said| said.1);
         let (transform, transform_position, moved) =
-            newest.unwrap_or((tile.transform, tile.position, Some(0)));
+            newest.unwrap_or((tile.transform, tile.position, Some(Mover::Records)));
         let place = self.place(&tile.name, tile.section, tile.size, transform)?;
         let id = match known {
             Some(id) => id,
@@ -197,7 +201,7 @@ impl<'c> Commit<'c> {
             transform_position.into(),
         ];
         values.extend(transform.elements().map(Value::from));
-        values.push(Value::MaybeInteger(moved));
+        values.push(Value::MaybeInteger(moved.map(Mover::number)));
         self.run(update, &values).await?;
         self.end_quarantine(&tile.name, tile.position).await?;
         self.forget_retired(&tile.pyramid).await?;
@@ -255,7 +259,10 @@ impl<'c> Commit<'c> {
         if position.is_some_and(|position| existing.transform_position >= position) {
             return Ok(TransformOutcome::Unchanged);
         }
-        let by_somebody = i64::from(position.is_none());
+        let by = match position {
+            Some(_) => Mover::Records,
+            None => Mover::somebody(transform),
+        };
         let position = position.unwrap_or(existing.transform_position);
         let place = self.place(tile, section, size, transform)?;
         self.end_misplacement(tile).await?;
@@ -271,7 +278,7 @@ impl<'c> Commit<'c> {
             self.run(update, &values).await?;
         }
         let update = "UPDATE tiles SET transform_position = $2, moved = $3 WHERE id = $1";
-        let values = [existing.id.0.into(), position.into(), by_somebody.into()];
+        let values = [existing.id.0.into(), position.into(), by.number().into()];
         self.run(update, &values).await?;
         Ok(if moved {
             TransformOutcome::Moved
@@ -534,7 +541,7 @@ impl<'c> Commit<'c> {
                 pyramid: rows::pyramid(&row).ok(),
                 position: rows::unsigned(&row, "position").unwrap_or(0),
                 transform_position: rows::unsigned(&row, "transform_position").unwrap_or(0),
-                moved: row.get::<Option<i64>>("moved").ok().flatten(),
+                moved: Mover::of(&row),
             })
         };
         decode().map(Some).map_err(|e| self.catalog.failed(e))

@@ -57,6 +57,23 @@ impl Catalog {
         })
     }
 
+    /// Takes rows of a lost volume out whose tiles the volume of its name has, and returns how many are left.
+    ///
+    /// # Errors
+    ///
+    /// What the database says.
+    pub async fn take_out_lost(&self, lost: &LostVolume) -> Result<u64, CatalogError> {
+        let take = "DELETE FROM tiles WHERE volume = $1 AND EXISTS \
+                    (SELECT 1 FROM tiles AS other JOIN volumes ON volumes.id = other.volume \
+                     WHERE volumes.name = $2 AND other.name = tiles.name AND other.deleted = 0)";
+        let values = [lost.number.into(), Value::MaybeText(lost.name.as_deref())];
+        let mut transaction = self.transaction(Durability::Durable).await?;
+        let done = transaction.run(take, &values).await;
+        done.map_err(|e| self.failed(e))?;
+        transaction.commit().await.map_err(|e| self.failed(e))?;
+        Ok(self.lost_volume(lost.number).await?.tiles)
+    }
+
     /// Enters a volume. One that was lost gets its number again, and with it its tiles; no other ever gets a number of which there is
     /// anything.
     pub(super) async fn insert_volume(

@@ -3,7 +3,7 @@
 use saccade_core::voxel_box::VoxelBox;
 
 use super::database::Row;
-use super::{Catalog, CatalogError, Tile, TileId, rows};
+use super::{Catalog, CatalogError, Mover, Tile, TileId, rows};
 
 /// Which records say what a tile is.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -25,8 +25,8 @@ pub struct Placing {
     pub transform_position: u64,
     /// The volume's revision when the tile last changed.
     pub revision: u64,
-    /// Whether somebody other than the records put it there, if that is known.
-    pub moved: Option<bool>,
+    /// Who put it there, if that is known.
+    pub moved: Option<Mover>,
     /// Which voxels changed then \[level-0 voxels\]; `None` if that is no longer kept.
     pub change: Option<VoxelBox>,
 }
@@ -123,7 +123,7 @@ fn placing(row: &Row) -> Result<Option<Placing>, sqlx::Error> {
         tile: TileId(row.get("placed")?),
         transform_position,
         revision,
-        moved: { row.get::<Option<i64>>("moved").ok().flatten() }.map(|moved| moved != 0),
+        moved: Mover::of(row),
         change: change.map(|change| change.voxels),
     }))
 }

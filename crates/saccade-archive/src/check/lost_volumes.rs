@@ -1,6 +1,6 @@
 //! Volumes that the catalog has lost, while it has their tiles.
 
-use super::{Check, CheckError, Finding, FindingKind};
+use super::{Check, CheckError, Finding, FindingKind, Repair};
 
 impl Check<'_> {
     /// Finds rows of tiles whose volume's row is gone. Of their pyramids nothing else is told, be they as many and as young as they
@@ -23,6 +23,11 @@ impl Check<'_> {
                 }
                 None => ", and none of these names a pyramid: put a copy of the catalog in its place",
             });
+            let mut repair = None;
+            if is_there && self.options.repair {
+                let left = self.archive.catalog().take_out_lost(&lost).await?;
+                repair = (left == 0).then_some(Repair::TakenAway);
+            }
             self.unknown.extend(lost.name.clone().filter(|_| !is_there));
             self.report.findings.push(Finding {
                 kind: FindingKind::Spoilt,
@@ -30,7 +35,7 @@ impl Check<'_> {
                 tile: None,
                 object: None,
                 reason,
-                repair: None,
+                repair,
             });
         }
         Ok(())

@@ -9,7 +9,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::{Check, CheckError, FindingKind, Repair, records::Said};
 use crate::acquisition::Record;
-use crate::catalog::{ChangeReason, Placing, Tile, VolumeEntry, place};
+use crate::catalog::{ChangeReason, Mover, Placing, Tile, VolumeEntry, place};
 
 impl Check<'_> {
     /// Finds out whether a tile lies where neither a record nor the catalog's changes say that it does, whatever else is wrong with it:
@@ -42,8 +42,8 @@ impl Check<'_> {
         let Some(placing) = placing.copied() else {
             return Ok(None);
         };
-        let is_told = placing.moved == Some(false) || placing.change.is_some();
-        if !is_told && self.lacks_change(entry, &placing).await? {
+        let is_noted = placing.moved.is_some() || placing.change.is_some();
+        if !is_noted && self.lacks_change(entry, &placing).await? {
             return self.untold(entry, tile, said).await;
         }
         let Some((to, reason)) = self.its_place(entry, &shaped, said, &placing) else {
@@ -183,6 +183,25 @@ impl Check<'_> {
         (name == tile.name && to != tile.transform).then_some((to, reason))
     }
 
+    /// Where a record has a tile.
+    fn said_place(&self, entry: &VolumeEntry, said: Said) -> Option<SectionFromTile> {
+        match self.record_at(entry, said.record)?.1 {
+            Record::Tile(record) => Some(record.transform),
+            Record::Transform(record) => Some(record.transform),
+            Record::Delete(_) => None,
+        }
+    }
+
+    /// Whether a row has it that a tile's newest record was followed. A position of nothing that is said of the tile says nothing.
+    fn is_followed(&self, entry: &VolumeEntry, tile: &Tile, said: Said, now: &Placing) -> bool {
+        let is_of = |at: u64| match self.record_at(entry, at)?.1 {
+            Record::Tile(record) => Some(record.tile == tile.name),
+            Record::Transform(record) => Some(record.tile == tile.name),
+            Record::Delete(_) => None,
+        };
+        now.transform_position == said.position || is_of(now.transform_position) != Some(true)
+    }
+
     /// Why nothing explains that a tile lies elsewhere than a record said; `None` if somebody may have moved it.
     fn unexplained(
         &self,
@@ -195,17 +214,25 @@ impl Check<'_> {
         if now.transform_position >= self.read?.offset {
             return None;
         }
-        // A position of nothing that is said of the tile says nothing.
-        let is_of = |at: u64| match self.record_at(entry, at)?.1 {
-            Record::Tile(record) => Some(record.tile == tile.name),
-            Record::Transform(record) => Some(record.tile == tile.name),
-            Record::Delete(_) => None,
-        };
-        if now.transform_position != said.position && is_of(now.transform_position) == Some(true) {
+        if !self.is_followed(entry, tile, said, now) {
             return Some("that one was not followed");
         }
-        if now.moved == Some(false) && now.transform_position == said.position {
-            return Some("nobody else has moved it, as the catalog tells");
+        match now.moved {
+            Some(Mover::Records) if now.transform_position == said.position => {
+                return Some("nobody else has moved it, as the catalog tells");
+            }
+            Some(by @ Mover::Somebody(_)) if by.is_to(tile.transform) => return None,
+            Some(by @ Mover::Somebody(_)) => {
+                let is_to = { self.said_place(entry, said) }.is_some_and(|to| by.is_to(to));
+                return Some(match is_to {
+                    true => "it was put there",
+                    false => {
+                        "somebody else has moved it, but not to where it lies: to where is lost, and is to be said with \
+                         `saccade update` once more"
+                    }
+                });
+            }
+            _ => {}
         }
         let lies = place(
             entry.volume.extent(),
@@ -224,12 +251,7 @@ impl Check<'_> {
             ChangeReason::Transform => may_have_come(came, lies, last.before),
             // One that is made anew stays where somebody has moved it.
             ChangeReason::Tile => {
-                let (_, record) = self.record_at(entry, said.record)?;
-                let to = match record {
-                    Record::Tile(record) => record.transform,
-                    Record::Transform(record) => record.transform,
-                    Record::Delete(_) => return None,
-                };
+                let to = self.said_place(entry, said)?;
                 let there = place(entry.volume.extent(), tile.section, tile.size, to);
                 let may_have_moved = last.was_moved || !self.history.is_whole();
                 may_have_moved && (there != Some(came) || lies == came)

@@ -6,7 +6,7 @@ use saccade_core::voxel_box::VoxelBox;
 
 use super::Commit;
 use crate::catalog::database::Value;
-use crate::catalog::{Ahead, CatalogError, ChangeReason, NamedRow, Tile, TileId, place};
+use crate::catalog::{Ahead, CatalogError, ChangeReason, Mover, NamedRow, Tile, TileId, place};
 
 impl Commit<'_> {
     /// Has a tile name another pyramid, if it is still as it was found. The one that it named is not retired: it is another's.
@@ -119,13 +119,14 @@ impl Commit<'_> {
         let at = place(self.extent, tile.section, tile.size, tile.transform);
         self.log_change(tile.id, at, at, ChangeReason::Transform)
             .await?;
-        let update = "UPDATE tiles SET revision = $4, moved = 1 \
+        let update = "UPDATE tiles SET revision = $4, moved = $5 \
                       WHERE id = $1 AND volume = $2 AND revision = $3 AND deleted = 0";
         let values = [
             tile.id.0.into(),
             self.volume.into(),
             tile.revision.into(),
             self.revision.into(),
+            Mover::somebody(tile.transform).number().into(),
         ];
         self.run(update, &values).await?;
         Ok(())
@@ -146,7 +147,7 @@ impl Commit<'_> {
             .await
     }
 
-    /// Has a tile lie elsewhere, if it is still as it was found, whatever else its row says.
+    /// Has a tile lie where its record says, if it is still as it was found, whatever else its row says.
     ///
     /// # Errors
     ///
@@ -156,7 +157,7 @@ impl Commit<'_> {
         let (old, new) = (at(tile.transform), at(to));
         self.log_change(tile.id, old, new, ChangeReason::Transform)
             .await?;
-        let update = "UPDATE tiles SET revision = $4, a = $5, b = $6, c = $7, d = $8, tx = $9, ty = $10, moved = NULL \
+        let update = "UPDATE tiles SET revision = $4, a = $5, b = $6, c = $7, d = $8, tx = $9, ty = $10, moved = 0 \
                       WHERE id = $1 AND volume = $2 AND revision = $3 AND deleted = 0";
         let mut values = vec![
             tile.id.0.into(),

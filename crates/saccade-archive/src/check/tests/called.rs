@@ -414,7 +414,9 @@ async fn what_the_lost_changes_would_tell_is_not_guessed() {
         let moved = [(FindingKind::Spoilt, Some(Repair::Moved))];
         assert_eq!(repairs(&fixture.look(true).await), moved);
         assert_eq!(fixture.transform("t2").await.elements()[4], 3.0);
-        fixture.meddle(&[lost, elsewhere]).await;
+        // Of tiles of earlier versions, nothing else tells.
+        let earlier = "UPDATE tiles SET moved = NULL";
+        fixture.meddle(&[lost, elsewhere, earlier]).await;
         let report = fixture.look(false).await;
         assert_eq!(found(&report), [(FindingKind::Spoilt, "t2")]);
         let reason = &report.findings[0].reason;

@@ -539,3 +539,86 @@ async fn of_a_tile_that_nobody_else_moved_the_place_is_its_records() {
         }
     }
 }
+
+/// Nor does one tell where within it somebody has put a tile; the row does, and whether it is still as it was then.
+#[tokio::test]
+async fn a_tile_that_somebody_moved_stays_unless_its_row_was_altered() {
+    let (to, cut) = (
+        at(40.0),
+        SectionFromTile::translation(DVec2::new(40.0, 800.0)),
+    );
+    for to in [to, cut] {
+        let fixture = Fixture::new().await;
+        let catalog = fixture.archive.catalog();
+        catalog.set_transform(VOLUME, "t2", to).await.unwrap();
+        // Whatever became of its change.
+        for changes in [
+            "UPDATE changes SET x1 = x0 + 1 WHERE reason = 'transform'",
+            "DELETE FROM changes WHERE reason = 'transform'",
+        ] {
+            fixture.meddle(&[changes]).await;
+            assert_eq!(fixture.look(true).await.findings, [], "{changes}");
+            assert_eq!(fixture.transform("t2").await, to);
+        }
+        for altered in ["tx = tx + 1", "ty = ty + 20", "a = 0.99", "b = 0.01"] {
+            catalog.set_transform(VOLUME, "t2", to).await.unwrap();
+            let alter = format!("UPDATE tiles SET {altered} WHERE name = 't2'");
+            fixture.meddle(&[&alter]).await;
+            // Where it was put nobody knows any more, but that it was not there.
+            let report = fixture.look(true).await;
+            let moved = [(FindingKind::Spoilt, Some(Repair::Moved))];
+            assert_eq!(repairs(&report), moved, "{altered}");
+            let reason = &report.findings[0].reason;
+            assert!(reason.contains("once more"), "{altered}: {reason}");
+            let said = SectionFromTile::translation(DVec2::splat(3.0));
+            assert_eq!(fixture.transform("t2").await, said);
+            assert_eq!(fixture.look(false).await.findings, [], "{altered}");
+        }
+    }
+}
+
+/// A transform that comes between somebody's deletion of a tile and its new image, as it is with a record's.
+#[tokio::test]
+async fn what_is_said_of_a_deleted_tile_before_it_comes_again_is_followed() {
+    let fixture = Fixture::new().await;
+    let catalog = fixture.archive.catalog();
+    fixture.delete("t2").await;
+    let early = fixture.append(&move_it("t2", at(50.0))).await;
+    let record = TileRecord {
+        tile: "t2".to_owned(),
+        file: "t2.tif".to_owned(),
+        section: 1,
+        size: UVec2::new(200, 150),
+        transform: at(100.0),
+        channel: None,
+    };
+    let position = fixture.append(&Record::Tile(record.clone())).await;
+    let object = format!("tiles/v/000001/t2-{position:x}.tif");
+    let bytes = fs::read(fixture.path(2)).unwrap();
+    let bytes = pyramid::named(bytes.into(), &object).unwrap();
+    let written = fixture.archive.storage().write_durable(&object, bytes);
+    written.await.unwrap();
+    let mut commit = catalog.begin(VOLUME).await.unwrap();
+    commit.transform("t2", at(50.0), Some(early)).await.unwrap();
+    let tile = NewTile {
+        name: record.tile,
+        section: record.section,
+        channel: 0,
+        size: record.size,
+        transform: record.transform,
+        pyramid: object,
+        position,
+    };
+    commit.tile(&tile, catalog.clock().now()).await.unwrap();
+    commit.finish().await.unwrap();
+    assert_eq!(fixture.transform("t2").await, at(50.0));
+    assert_eq!(fixture.look(false).await.damage(), 0);
+    // Not where nobody has put it.
+    fixture
+        .meddle(&["UPDATE tiles SET tx = 60 WHERE name = 't2'"])
+        .await;
+    assert_eq!(
+        found(&fixture.look(false).await)[0],
+        (FindingKind::Spoilt, "t2")
+    );
+}

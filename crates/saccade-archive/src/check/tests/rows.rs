@@ -459,3 +459,33 @@ async fn a_tile_in_another_section_than_its_pyramid_is_told_without_records() {
     let sound = fixture.archive.catalog().tile(VOLUME, "t5").await.unwrap();
     assert_eq!(sound.unwrap().section, 2);
 }
+
+#[tokio::test]
+async fn rows_of_no_volume_whose_tiles_came_again_are_taken_out() {
+    let fixture = Fixture::new().await;
+    let lose = "PRAGMA foreign_keys = OFF; UPDATE tiles SET volume = 3 WHERE name = 't2'; PRAGMA foreign_keys = ON";
+    fixture.meddle(&[lose]).await;
+    assert!(fixture.look(true).await.damage() > 0);
+    let catalog = fixture.archive.catalog();
+    assert_eq!(catalog.lost_volumes().await.unwrap().len(), 1);
+    fixture.ingest().await;
+    assert_eq!(fixture.look(true).await.damage(), 0);
+    assert_eq!(catalog.lost_volumes().await.unwrap(), []);
+    assert!(catalog.tile(VOLUME, "t2").await.unwrap().is_some());
+    assert_eq!(fixture.look(false).await.findings, []);
+}
+
+#[tokio::test]
+async fn a_count_that_cannot_be_keeps_nobody_from_a_volume() {
+    let fixture = Fixture::new().await;
+    fixture.meddle(&["UPDATE volumes SET tiles = -1"]).await;
+    let catalog = fixture.archive.catalog();
+    assert!(catalog.tile(VOLUME, "t2").await.unwrap().is_some());
+    let counted = [(FindingKind::Miscounted, Some(Repair::Recounted))];
+    let report = fixture.look(true).await;
+    let found: Vec<_> = { report.findings.iter() }
+        .map(|f| (f.kind, f.repair))
+        .collect();
+    assert_eq!(found, counted);
+    assert_eq!(catalog.entry(VOLUME).await.unwrap().tiles, u64::from(TILES));
+}
